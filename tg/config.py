@@ -1,0 +1,43 @@
+"""Configuration of the trajectory generator (TG)."""
+
+import dataclasses
+
+
+@dataclasses.dataclass(frozen=True)
+class TGConfig:
+    """Sizes of the trajectory generator and scales of the action.
+
+    The paper gives none of these numbers; the defaults follow public work by the same authors and were tuned by
+    training (docs/experiments.md).
+    """
+
+    base_frequency: float = 1.6
+    """f_base, gait cycles per second at action 0 (Hz)."""
+    frequency_range: float = 0.5
+    """δf at action ±1 (Hz)."""
+    step_length: float = 0.2
+    """L, the stride from lift-off to touch-down (m). 0 leaves only the vertical motion (the fixed-height baseline)."""
+    lift: float = 0.08
+    """H, the predefined foot height (m)."""
+    lift_range: float = 0.06
+    """δh at action ±1 (m). 0 fixes the foot height."""
+    lift_min: float = 0.02
+    """Lower bound of H + δh (m)."""
+    lift_max: float = 0.14
+    """Upper bound of H + δh (m): higher than this the knee limit is reached."""
+    residual_range: float = 0.25
+    """Residual joint angle at action ±1 (rad); small enough that residuals cannot cancel a whole step."""
+    levelling: float = 1.0
+    """Share of the trunk's roll and pitch that is taken out of the feet's base positions. 1 is the paper's horizontal
+    frame: the feet stay straight below the hips, but the stance legs no longer turn the trunk back to level. The
+    motion of the feet along their path is horizontal in any case."""
+    weight_compensation: float = 1.0
+    """Share of the joints' sag under the robot's weight that is added to the desired angles of the stance legs
+    (torque / kp). The paper's PID controller has no gains; a plain PD at kp 50 sags by 4 cm on two legs, which also
+    moves the feet 4 cm in front of the hips."""
+    start_time: float = 0.2
+    """Time in which the TG's motion is faded in from standing, and out to standing (s)."""
+    mirror: bool = True
+    """Let the policy see a command to the right as its mirror image to the left: halves what it has to learn."""
+    mirror_hysteresis: float = 0.15
+    """The mirror flips when the command's lateral part passes this far to the other side."""

@@ -1,0 +1,332 @@
+"""The controller core: observation in, action in, desired joint angles out.
+
+Everything the policy sees and does passes through `Core`, written against the array API, so that the same lines run
+under JAX in training and under NumPy on the robot. Letters: L = 4 legs (LF, RF, LR, RR), J = 12 joints (leg by leg:
+abduction, hip, knee), P = 25 sample points a foot, S = size of the observation.
+"""
+
+import dataclasses
+import functools
+from typing import Any, NamedTuple
+
+from tg import frames, leg, path, samples
+from tg.config import TGConfig
+
+Array = Any
+
+ACTION_SIZE = 14
+"""δf, δh and twelve residual joint angles, each in [-1, 1]."""
+ACTION_HISTORY = 2
+TARGET_HISTORY = 2
+HEIGHT_CLIP = 0.25
+"""Heights below the foot are cut to ± this (m): deeper than that, a hole is a hole."""
+
+_MIRRORED_LEG = (1, 0, 3, 2)
+
+
+class Sensors(NamedTuple):
+    """What a robot measures: no position, no velocity of the trunk."""
+
+    orientation: Array
+    """(4,) unit quaternion w, x, y, z, world from trunk; its yaw is not used."""
+    angular_velocity: Array
+    """(3,) rad/s, trunk frame."""
+    joint_position: Array
+    """(12,) rad."""
+    joint_velocity: Array
+    """(12,) rad/s."""
+
+
+class ControllerState(NamedTuple):
+    """What the controller remembers within an episode."""
+
+    phase: Array
+    """() rad, of LF, in [-π, π)."""
+    frequency: Array
+    """() Hz, f_base + δf of the last step."""
+    lift: Array
+    """(4,) m, H + δh of each leg, held from lift-off to touch-down."""
+    stride: Array
+    """(2,) the direction in which the feet are led (heading frame), the command faded in and out."""
+    gate: Array
+    """() in [0, 1], share of the vertical motion: 0 standing, 1 walking."""
+    mirror: Array
+    """() +1, or -1 while the policy sees the mirror image."""
+    actions: Array
+    """(2, 14) last actions, newest first, robot's own side."""
+    targets: Array
+    """(2, 12) m, last desired foot positions from the abduction joints (trunk frame), newest first."""
+    desired: Array
+    """(12,) rad, last desired joint angles."""
+
+
+def _layout(heights: bool) -> tuple[tuple[str, int], ...]:
+    parts = [
+        ("command", 2),
+        ("up", 3),
+        ("angular_velocity", 3),
+        ("joint_position", 12),
+        ("joint_velocity", 12),
+        ("frequency", 1),
+        ("phase", 2),
+        ("actions", ACTION_HISTORY * ACTION_SIZE),
+        ("targets", TARGET_HISTORY * 12),
+    ]
+    return (*parts, ("heights", 100)) if heights else tuple(parts)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Core:
+    """Trajectory generator, observation and joint targets of one robot. All methods are pure."""
+
+    config: TGConfig
+    geometry: leg.LegGeometry
+    base_foot: Array
+    """(4, 3) m, foot positions of the standing robot from the abduction joints, horizontal frame."""
+    default_pose: Array
+    """(12,) rad, joint angles there."""
+    lower: Array
+    """(12,) rad."""
+    upper: Array
+    """(12,) rad."""
+    dt: float
+    """Control period (s)."""
+    sag: float
+    """Weight of the robot over kp (N·rad/(N·m)): how far a joint sags by a lever of 1 m."""
+    heights: bool = True
+    """Whether the policy sees the terrain (not with `method=blind`)."""
+
+    @functools.cached_property
+    def layout(self) -> tuple[tuple[str, int], ...]:
+        """Names and sizes of the parts of the observation, in order."""
+        return _layout(self.heights)
+
+    @property
+    def observation_size(self) -> int:
+        """S."""
+        return sum(size for _, size in self.layout)
+
+    @property
+    def standing_target(self) -> Array:
+        """Desired joint angles (12,) rad of the standing robot: the default pose, and what the weight asks for."""
+        pose = self.default_pose.reshape(4, 3)
+        load = self.config.weight_compensation * self.sag * 0.25 * abs(self.geometry.thigh / self.geometry.thigh)
+        return (pose + leg.support_torque(self.geometry, pose, load)).reshape(-1)
+
+    def initial_state(self, phase: Array) -> ControllerState:
+        """A standing robot's state, its gait to start at a phase () rad."""
+        xp = phase.__array_namespace__()
+        zero = 0.0 * phase
+        targets = xp.reshape(xp.asarray(self.base_foot, dtype=phase.dtype), (12,))
+        return ControllerState(
+            phase=path.wrap(phase),
+            frequency=zero + self.config.base_frequency,
+            lift=xp.zeros((4,), dtype=phase.dtype) + self._lift(zero),
+            stride=xp.zeros((2,), dtype=phase.dtype),
+            gate=zero,
+            mirror=zero + 1.0,
+            actions=xp.zeros((ACTION_HISTORY, ACTION_SIZE), dtype=phase.dtype),
+            targets=xp.stack([targets] * TARGET_HISTORY),
+            desired=xp.asarray(self.standing_target, dtype=phase.dtype),
+        )
+
+    def feet(self, sensors: Sensors) -> Array:
+        """Foot centres (4, 3) m from the trunk's centre, heading frame."""
+        xp = sensors.joint_position.__array_namespace__()
+        q = xp.reshape(sensors.joint_position, (4, 3))
+        in_trunk = self.geometry.hip_position + leg.forward(self.geometry, q)
+        return in_trunk @ frames.heading_from_trunk(frames.up_in_trunk(sensors.orientation)).T
+
+    def sample_points(self, feet: Array) -> Array:
+        """Points (4, 25, 2) m at which the terrain's height is wanted, from the trunk's centre, heading frame.
+
+        Args:
+          feet: (4, 3) m, of `feet`.
+        """
+        xp = feet.__array_namespace__()
+        return feet[:, None, :2] + xp.asarray(samples.ring_offsets(), dtype=feet.dtype)
+
+    def observe(self, state: ControllerState, sensors: Sensors, heights: Array | None, command: Array) -> Array:
+        """The policy's observation.
+
+        Args:
+          state: of the controller.
+          sensors: of the robot.
+          heights: (4, 25) m, the terrain's at `sample_points`, from the trunk's centre, up positive; None if blind.
+          command: (2,) direction in the heading frame, a unit vector, or 0 to stand.
+
+        Returns:
+          (S,) in the order of `layout`, mirrored where `update_mirror` says so.
+        """
+        xp = command.__array_namespace__()
+        parts = [
+            command,
+            frames.up_in_trunk(sensors.orientation),
+            0.25 * sensors.angular_velocity,
+            sensors.joint_position - self.default_pose,
+            0.1 * sensors.joint_velocity,
+            xp.reshape(state.frequency - self.config.base_frequency, (1,)),
+            xp.stack([xp.sin(state.phase), xp.cos(state.phase)]),
+            xp.reshape(state.actions, (-1,)),
+            xp.reshape(10.0 * (xp.reshape(state.targets, (TARGET_HISTORY, 4, 3)) - self.base_foot), (-1,)),
+        ]
+        if self.heights:
+            # z_ij = f_ij - h_ij: how far the terrain lies below the foot.
+            below = self.feet(sensors)[:, 2:] - heights
+            parts.append(xp.reshape(5.0 * xp.clip(below, -HEIGHT_CLIP, HEIGHT_CLIP), (-1,)))
+        observation = xp.concatenate(parts)
+        mirror = self.update_mirror(state.mirror, command)
+        index, sign = self._observation_mirror
+        return xp.where(mirror > 0, observation, observation[xp.asarray(index)] * xp.asarray(sign, dtype=mirror.dtype))
+
+    def act(
+        self, state: ControllerState, action: Array, sensors: Sensors, command: Array
+    ) -> tuple[ControllerState, Array]:
+        """One control step: the policy's action to desired joint angles.
+
+        Args:
+          state: of the controller.
+          action: (14,) in [-1, 1], as the policy gave it (mirrored if its observation was).
+          sensors: those of the observation.
+          command: that of the observation.
+
+        Returns:
+          The next state, and the desired joint angles (12,) rad.
+        """
+        xp, c = action.__array_namespace__(), self.config
+        mirror = self.update_mirror(state.mirror, command)
+        action = self.mirror_action(mirror, xp.clip(action, -1.0, 1.0))
+        frequency = c.base_frequency + c.frequency_range * action[0]
+        moving = xp.where(xp.sum(command * command) > 0.25, 1.0 + 0.0 * frequency, 0.0 * frequency)
+
+        phase = path.wrap(state.phase + moving * (path.advance(state.phase, frequency, self.dt) - state.phase))
+        step = self.dt / c.start_time
+        gate = state.gate + xp.clip(moving - state.gate, -step, step)
+        stride = state.stride + xp.clip(command - state.stride, -step, step)
+        phases = path.leg_phases(phase)
+        lift = xp.where(phases > 0, state.lift, self._lift(action[1]))
+
+        targets = self.foot_targets(phases, lift * gate, stride, sensors)
+        tg_angles = leg.inverse(self.geometry, targets)
+        residual = c.residual_range * xp.reshape(action[2:], (4, 3))
+        wanted = tg_angles + residual
+        reached = leg.forward(self.geometry, wanted)
+        sag = leg.support_torque(self.geometry, wanted, c.weight_compensation * self.sag * load_share(phases, gate))
+        desired = xp.clip(xp.reshape(wanted + sag, (12,)), self.lower, self.upper)
+        state = ControllerState(
+            phase=phase,
+            frequency=frequency,
+            lift=lift,
+            stride=stride,
+            gate=gate,
+            mirror=mirror,
+            actions=xp.stack([action, *state.actions[: ACTION_HISTORY - 1]]),
+            targets=xp.stack([xp.reshape(reached, (12,)), *state.targets[: TARGET_HISTORY - 1]]),
+            desired=desired,
+        )
+        return state, desired
+
+    def foot_targets(self, phases: Array, lift: Array, stride: Array, sensors: Sensors) -> Array:
+        """pos^d = [dx + X, dy + Y, dz + Z] of the paper, turned from the horizontal frame into the trunk's.
+
+        Args:
+          phases: (4,) rad.
+          lift: (4,) m.
+          stride: (2,) direction in the heading frame; the step is L times as long.
+          sensors: whose roll and pitch are taken out.
+
+        Returns:
+          (4, 3) m from the abduction joints, trunk frame.
+        """
+        xp = phases.__array_namespace__()
+        along = path.stride(phases)[:, None] * (self.config.step_length * stride)
+        motion = xp.concatenate([along, (lift * path.height(phases))[:, None]], axis=-1)
+        horizontal = frames.heading_from_trunk(frames.up_in_trunk(sensors.orientation))
+        share = self.config.levelling
+        return (share * self.base_foot + motion) @ horizontal + (1.0 - share) * self.base_foot
+
+    def update_mirror(self, mirror: Array, command: Array) -> Array:
+        """+1 for commands to the left, -1 to the right, with hysteresis around straight ahead."""
+        xp = command.__array_namespace__()
+        if not self.config.mirror:
+            return mirror
+        return xp.where(command[1] * mirror < -self.config.mirror_hysteresis, -mirror, mirror)
+
+    def mirror_action(self, mirror: Array, action: Array) -> Array:
+        """An action (14,) turned into its mirror image where mirror () is -1."""
+        xp = action.__array_namespace__()
+        index, sign = _mirror_map([("scalar", 2), ("joints", 12)])
+        return xp.where(mirror > 0, action, action[xp.asarray(index)] * xp.asarray(sign, dtype=action.dtype))
+
+    def _lift(self, action: Array) -> Array:
+        xp, c = action.__array_namespace__(), self.config
+        return xp.clip(c.lift + c.lift_range * action, c.lift_min, c.lift_max)
+
+    @functools.cached_property
+    def _observation_mirror(self) -> tuple[list[int], list[float]]:
+        kinds: list[tuple[str, int]] = []
+        for name, size in self.layout:
+            if name == "actions":
+                kinds += [("scalar", 2), ("joints", 12)] * ACTION_HISTORY
+            elif name == "targets":
+                kinds += [("feet", 12)] * TARGET_HISTORY
+            else:
+                kinds.append((_KIND[name], size))
+        return _mirror_map(kinds)
+
+
+def load_share(phases: Array, gate: Array) -> Array:
+    """Share (4,) of the weight on each leg: even over the legs in stance, handed over smoothly.
+
+    Args:
+      phases: (4,) rad.
+      gate: () share of the vertical motion.
+    """
+    xp = phases.__array_namespace__()
+    stance = 1.0 - gate * xp.minimum(4.0 * path.height(phases), 1.0 + 0.0 * phases)
+    return stance / xp.sum(stance)
+
+
+_KIND = {
+    "command": "polar",
+    "up": "polar",
+    "angular_velocity": "axial",
+    "joint_position": "joints",
+    "joint_velocity": "joints",
+    "frequency": "scalar",
+    "phase": "phase",
+    "heights": "heights",
+}
+
+
+def _legwise(points: list[int], signs: tuple[float, ...]) -> tuple[list[int], list[float]]:
+    size = len(points)
+    index = [other * size + p for other in _MIRRORED_LEG for p in points]
+    return index, list(signs) * (4 * size // len(signs))
+
+
+def _mirror_part(kind: str, size: int) -> tuple[list[int], list[float]]:
+    """Index and sign that mirror one part of a vector in the trunk's x-z plane."""
+    if kind == "polar":
+        return list(range(size)), [1.0, -1.0, 1.0][:size]
+    if kind == "axial":
+        return list(range(size)), [-1.0, 1.0, -1.0][:size]
+    if kind == "phase":  # LF's mirror image is RF, half a cycle away: sine and cosine change sign
+        return list(range(size)), [-1.0] * size
+    if kind == "joints":
+        return _legwise([0, 1, 2], (-1.0, 1.0, 1.0))
+    if kind == "feet":
+        return _legwise([0, 1, 2], (1.0, -1.0, 1.0))
+    if kind == "heights":
+        return _legwise(samples.mirrored_points(), (1.0,))
+    return list(range(size)), [1.0] * size
+
+
+def _mirror_map(kinds: list[tuple[str, int]]) -> tuple[list[int], list[float]]:
+    index: list[int] = []
+    sign: list[float] = []
+    for kind, size in kinds:
+        part, part_sign = _mirror_part(kind, size)
+        index += [len(sign) + i for i in part]
+        sign += part_sign
+    return index, sign
