@@ -1,0 +1,28 @@
+"""The quadruped environment on MJX."""
+
+from envs.auto_reset import AutoReset
+from envs.config import METHODS, CurriculumConfig, EnvConfig, RandomisationConfig
+from envs.env import GOAL, QuadrupedEnv
+from envs.robot import ROBOTS, RobotConfig
+from envs.types import Episode, Randomised
+
+
+def make(config: EnvConfig) -> QuadrupedEnv:
+    """The environment of a configuration; builds its bank of terrains."""
+    return QuadrupedEnv(config)
+
+
+__all__ = [
+    "GOAL",
+    "METHODS",
+    "ROBOTS",
+    "AutoReset",
+    "CurriculumConfig",
+    "EnvConfig",
+    "Episode",
+    "QuadrupedEnv",
+    "Randomised",
+    "RandomisationConfig",
+    "RobotConfig",
+    "make",
+]

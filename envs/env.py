@@ -1,0 +1,444 @@
+"""The environment: a quadruped on a bank of terrains, one instance an environment, pure functions throughout.
+
+Letters: L = 4 legs (LF, RF, LR, RR), J = 12 joints, P = 25 sample points a foot.
+"""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from brax.envs.base import Env, State
+from mujoco import mjx
+
+import rewards
+import terrains
+import tg
+from envs import physics
+from envs.config import METHODS, EnvConfig
+from envs.robot import Robot
+from envs.types import Episode, Randomised
+
+GOAL = 5.0
+"""Distance (m) at which the paper stops counting."""
+
+
+class QuadrupedEnv(Env):
+    """`reset` and `step` of one environment; `jax.vmap` for batches. `step` never resets, see `AutoReset`.
+
+    Observation: `state` (S,), what the robot can know, and `privileged_state` (V,), for the critic.
+    Action: (14,) in [-1, 1]: δf, δh, residual joint angles.
+    """
+
+    def __init__(self, config: EnvConfig, bank: terrains.Bank | None = None):
+        check(config)
+        self.config = config
+        self.bank = make_bank(config) if bank is None else bank
+        self.mj_model, self.robot = physics.physics_model(config.robot, config.physics_dt, config.num_planes)
+        self.core = make_core(config, self.robot)
+        self.standing = physics.settle(self.mj_model, self.robot, self.core.standing_target)
+        self.substeps = round(config.control_dt / config.physics_dt)
+        self.episode_steps = round(config.episode_time / config.control_dt)
+        self.levels = len(config.curriculum.difficulty)
+        self._model = mjx.put_model(self.mj_model)
+        self._data = mjx.make_data(self._model)
+        self._planes = physics.plane_ids(self.mj_model, config.num_planes)
+        self._rings = np.array([radius for count, radius in tg.samples.RINGS for _ in range(count)])
+
+    # --- Brax's interface ---------------------------------------------------------------------------------------------
+
+    @property
+    def observation_size(self) -> dict[str, int]:
+        """Sizes of the parts of the observation."""
+        return {"state": self.core.observation_size, "privileged_state": self.privileged_size}
+
+    @property
+    def action_size(self) -> int:
+        """14."""
+        return tg.ACTION_SIZE
+
+    @property
+    def backend(self) -> str:
+        """Physics engine."""
+        return "mjx"
+
+    @property
+    def dt(self) -> float:
+        """Control period (s)."""
+        return self.config.control_dt
+
+    @property
+    def privileged_size(self) -> int:
+        """V: the observation, 100 true heights where the policy is blind, and 24 more (see `_privileged`)."""
+        return self.core.observation_size + (0 if self.core.heights else 100) + 24
+
+    def reset(self, key: jax.Array) -> State:
+        """A robot standing on the start platform of a random terrain, with a random command.
+
+        Args:
+          key: random key.
+        """
+        key, key_level = jax.random.split(key)
+        top = self.config.curriculum.start + 1 if self.config.curriculum.enabled else self.levels
+        level = jax.random.randint(key_level, (), 0, min(top, self.levels))
+        episode = self.begin(key, level)
+        zero = jnp.zeros(())
+        metrics = {name: zero for name in self.metric_names} | {"level": self._share(level)}
+        info = {"truncation": zero, "level": level}
+        return State(episode, self.observe(episode), zero, zero, metrics, info)
+
+    def step(self, state: State, action: jax.Array) -> State:
+        """One control step (`control_dt`).
+
+        Args:
+          state: of `reset` or `step`.
+          action: (14,) in [-1, 1].
+        """
+        state = self.advance(state, action)
+        return state.replace(obs=self.observe(state.pipeline_state))
+
+    # --- the parts of a step, which `AutoReset` puts together in another way -----------------------------------------------
+
+    @property
+    def metric_names(self) -> tuple[str, ...]:
+        """Names in `state.metrics`."""
+        terms = ("along", "across", "smooth", "energy", "terrain", "height", "yaw", "tilt")
+        ends = ("ended", "distance", "length", "fell", "level", "exploded")
+        return (*(f"reward/{t}" for t in terms), *(f"episode/{e}" for e in ends), "speed", "lift", "level")
+
+    def begin(self, key: jax.Array, level: jax.Array) -> Episode:
+        """A new episode on a level () int32 of the ladder."""
+        c = self.config
+        keys = iter(jax.random.split(key, 10))
+        lower = jax.random.randint(next(keys), (), 0, jnp.maximum(level, 1))
+        level = jnp.where(jax.random.uniform(next(keys)) < c.curriculum.revisit, lower, level)
+        # Instance k has difficulty k % levels.
+        rows = max(self.bank.num_terrains // self.levels, 1)
+        terrain = (jax.random.randint(next(keys), (), 0, rows) * self.levels + level) % self.bank.num_terrains
+        xy = jax.random.uniform(next(keys), (2,), minval=-1.0, maxval=1.0) * c.spawn_offset
+        yaw, angle = jax.random.uniform(next(keys), (2,), minval=-1.0, maxval=1.0) * jnp.array([c.spawn_yaw, jnp.pi])
+        # At ±π/2 every foot is in the middle of its step: fading in the stride pushes the robot neither way.
+        phase = jnp.where(jax.random.bernoulli(next(keys)), 0.5, -0.5) * jnp.pi
+        walk = jax.random.uniform(next(keys)) >= c.stand_share
+        command = jnp.where(walk, jnp.stack([jnp.cos(angle), jnp.sin(angle)]), 0.0)
+        ground = terrains.height(self.bank, terrain, xy)
+        qpos = jnp.asarray(self.standing, jnp.float32)
+        # Yaw times the settled pitch.
+        (w, _, y, _), cos, sin = self.standing[3:7], jnp.cos(yaw / 2), jnp.sin(yaw / 2)
+        turned = jnp.stack([cos * w, -sin * y, cos * y, sin * w])
+        qpos = qpos.at[:2].set(xy).at[2].add(ground).at[3:7].set(turned)
+        depth = jnp.asarray(c.curriculum.depth, jnp.float32)[level]
+        return Episode(
+            qpos=qpos,
+            qvel=jnp.zeros(18),
+            warmstart=jnp.zeros(18),
+            torque=jnp.zeros(12),
+            controller=self.core.initial_state(phase),
+            terrain=terrain,
+            level=level,
+            floor=jnp.maximum(self.bank.floor[terrain], -depth),
+            command=command,
+            origin=xy,
+            progress=jnp.zeros(()),
+            lift_off=jnp.zeros(4) + ground,
+            step=jnp.int32(0),
+            randomised=self._randomise(next(keys)),
+            key=next(keys),
+        )
+
+    def advance(self, state: State, action: jax.Array) -> State:
+        """`step` without the observation."""
+        before: Episode = state.pipeline_state
+        sensors, command = self.sense(before), self.heading_command(before)
+        controller, desired = self.core.act(before.controller, action, sensors, command)
+        after = self._simulate(before, desired)
+        after = after.replace(controller=controller, step=before.step + 1)
+        feet, below, around = self._feet_and_terrain(after)
+        after = after.replace(
+            progress=jnp.maximum(before.progress, (after.qpos[:2] - after.origin) @ after.command),
+            lift_off=jnp.where(tg.path.leg_phases(controller.phase) > 0, before.lift_off, around[:, 0]),
+        )
+        terms = self._reward_terms(before, after, below, around)
+        reward, weighted = rewards.total(self.config.rewards, terms)
+
+        finite = jnp.all(jnp.isfinite(after.qpos)) & jnp.all(jnp.isfinite(after.qvel))
+        exploded = ~finite | (jnp.max(jnp.abs(after.qvel)) > 200.0)
+        fell = self._fell(after, feet, below, around) | exploded
+        over = (after.step >= self.episode_steps) | (after.progress >= GOAL) | self._off_map(after)
+        truncated = over & ~fell
+        done = over | fell
+        reward = jnp.where(exploded, 0.0, reward)
+        ends = {
+            "ended": 1.0,
+            "distance": jnp.clip(after.progress, 0.0, GOAL),
+            "length": after.step,
+            "fell": fell,
+            "level": self._share(state.info["level"]),
+            "exploded": exploded,
+        }
+        metrics = {f"reward/{name}": jnp.where(exploded, 0.0, value) for name, value in weighted.items()}
+        metrics |= {f"episode/{name}": jnp.where(done, jnp.float32(value), 0.0) for name, value in ends.items()}
+        metrics |= {
+            "speed": jnp.where(exploded, 0.0, after.qvel[:2] @ after.command),
+            "lift": jnp.mean(controller.lift),
+            "level": self._share(state.info["level"]),
+        }
+        return state.replace(
+            pipeline_state=after,
+            reward=reward,
+            done=done.astype(jnp.float32),
+            metrics=state.metrics | metrics,
+            info=state.info | {"truncation": truncated.astype(jnp.float32)},
+        )
+
+    def next_level(self, episode: Episode, level: jax.Array, fell: jax.Array) -> jax.Array:
+        """The ladder's level () after an ended episode: up when the robot got far, down when it didn't."""
+        c = self.config.curriculum
+        if not c.enabled:
+            return level
+        reachable = min(self.config.rewards.speed_low * self.config.episode_time, GOAL)
+        walked = jnp.sum(jnp.square(episode.command)) > 0.5
+        counts = walked & (episode.level == level)  # not what was revisited
+        up = counts & ~fell & (episode.progress > c.up * reachable)
+        down = counts & (episode.progress < c.down * reachable)
+        return jnp.clip(level + up.astype(jnp.int32) - down.astype(jnp.int32), 0, self.levels - 1)
+
+    # --- senses --------------------------------------------------------------------------------------------------------
+
+    def heading_command(self, episode: Episode) -> jax.Array:
+        """The command (2,) in the heading frame."""
+        return tg.frames.turn(-tg.frames.yaw(episode.qpos[3:7]), episode.command)
+
+    def sense(self, episode: Episode) -> tg.Sensors:
+        """What the robot measures, with noise; the same at every call on the same episode."""
+        r = self.config.randomisation
+        clean = tg.Sensors(episode.qpos[3:7], episode.qvel[3:6], episode.qpos[7:], episode.qvel[6:])
+        if not r.enabled:
+            return clean
+        noise = jax.random.normal(jax.random.fold_in(episode.key, 1), (30,))
+        # Half angles about x and y turn the quaternion by the tilt error.
+        roll, pitch = 0.5 * r.tilt_noise * noise[0], 0.5 * r.tilt_noise * noise[1]
+        w, x, y, z = clean.orientation
+        turned = jnp.stack([w - x * roll - y * pitch, x + w * roll - z * pitch, y + w * pitch + z * roll, z + x * pitch - y * roll])
+        return tg.Sensors(
+            turned / jnp.linalg.norm(turned),
+            clean.angular_velocity + r.angular_velocity_noise * noise[2:5],
+            clean.joint_position + r.joint_position_noise * noise[5:17],
+            clean.joint_velocity + r.joint_velocity_noise * noise[17:29],
+        )
+
+    def observe(self, episode: Episode) -> dict[str, jax.Array]:
+        """The observations of policy and critic."""
+        sensors, command = self.sense(episode), self.heading_command(episode)
+        yaw = tg.frames.yaw(episode.qpos[3:7])
+        points = self.core.sample_points(self.core.feet(sensors))
+        offset = episode.randomised.map_offset
+        true = self._heights(episode, yaw, points)
+        heights = self._heights(episode, yaw, points + offset[:2]) + offset[2] if self.config.randomisation.enabled else true
+        if self.config.randomisation.enabled:
+            noise = jax.random.normal(jax.random.fold_in(episode.key, 2), heights.shape)
+            heights = heights + self.config.randomisation.height_noise * noise
+        state = self.core.observe(episode.controller, sensors, heights if self.core.heights else None, command)
+        return {"state": state, "privileged_state": self._privileged(episode, state, true, command)}
+
+    def _heights(self, episode: Episode, yaw: jax.Array, points: jax.Array) -> jax.Array:
+        """Terrain heights (...) m from the trunk's centre, at points (..., 2) m of the heading frame."""
+        world = episode.qpos[:2] + tg.frames.turn(yaw, points)
+        return terrains.height(self.bank, episode.terrain, world) - episode.qpos[2]
+
+    def _privileged(self, episode: Episode, state: jax.Array, true: jax.Array, command: jax.Array) -> jax.Array:
+        """The critic's observation: the policy's, 100 heights where it has none, and 24 values it can't know."""
+        r, mirror = episode.randomised, self.core.update_mirror(episode.controller.mirror, command)
+        velocity = tg.frames.turn(-tg.frames.yaw(episode.qpos[3:7]), episode.qvel[:2]) * jnp.stack([1.0 + 0 * mirror, mirror])
+        below = self.core.feet(tg.Sensors(episode.qpos[3:7], episode.qvel[3:6], episode.qpos[7:], episode.qvel[6:]))[:, 2] - true[:, 0]
+        order = jnp.where(mirror > 0, jnp.arange(4), jnp.array([1, 0, 3, 2]))
+        rest = jnp.concatenate(
+            [
+                velocity,
+                episode.qvel[2:3],
+                10.0 * jnp.clip(below[order] - self.robot.foot_radius, -0.1, 0.1),
+                episode.controller.lift[order] * 10.0,
+                episode.qpos[2:3] - jnp.mean(true[:, 0] + episode.qpos[2]),
+                jnp.stack(
+                    [
+                        r.friction,
+                        r.payload,
+                        10.0 * (r.kp_factor - 1.0),
+                        10.0 * (r.kd_factor - 1.0),
+                        r.latency.astype(jnp.float32),
+                        10.0 * jnp.maximum(episode.floor, -0.2),
+                        self._share(episode.level),
+                        episode.progress,
+                        episode.step / self.episode_steps,
+                        episode.controller.gate,
+                    ]
+                ),
+                episode.controller.stride * jnp.stack([1.0 + 0 * mirror, mirror]),
+            ]
+        )
+        parts = [state, rest]
+        if not self.core.heights:
+            parts.append(5.0 * jnp.clip(below[:, None] + true[:, :1] - true, -0.25, 0.25).reshape(-1))
+        return jnp.concatenate(parts)
+
+    # --- physics --------------------------------------------------------------------------------------------------------
+
+    def _simulate(self, episode: Episode, desired: jax.Array) -> Episode:
+        """Physics over one control period, joints under PD control."""
+        c, r = self.config, episode.randomised
+        model = self._model
+        if c.randomisation.enabled:
+            trunk = self.robot.trunk_id
+            model = model.replace(
+                body_mass=model.body_mass.at[trunk].add(r.payload),
+                pair_friction=model.pair_friction.at[:, :2].set(r.friction),
+            )
+        contact = functools.partial(
+            terrains.contact, self.bank, episode.terrain, floor=episode.floor, num_planes=c.num_planes
+        )
+        key, key_push = jax.random.split(episode.key)
+        data = self._data.replace(
+            qpos=episode.qpos, qvel=episode.qvel + self._push(key_push), qacc_warmstart=episode.warmstart
+        )
+        kp, kd = c.robot.kp * r.kp_factor, c.robot.kd * r.kd_factor
+        limit = self.robot.torque_limit
+
+        def one(carry, i):
+            qpos, qvel, warmstart, _ = carry
+            followed = jnp.where(i < r.latency, episode.controller.desired, desired)
+            torque = jnp.clip(kp * (followed - qpos[7:]) - kd * qvel[6:], -limit, limit)
+            now = data.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart)
+            now = physics.substep(
+                model, now, self._planes, self.robot.foot_geom_ids, contact, jnp.concatenate([jnp.zeros(6), torque])
+            )
+            return (now.qpos, now.qvel, now.qacc_warmstart, torque), None
+
+        start = (data.qpos, data.qvel, data.qacc_warmstart, episode.torque)
+        (qpos, qvel, warmstart, torque), _ = jax.lax.scan(one, start, jnp.arange(self.substeps))
+        return episode.replace(qpos=qpos, qvel=qvel, warmstart=warmstart, torque=torque, key=key)
+
+    def _push(self, key: jax.Array) -> jax.Array:
+        """A change of velocity (18,), zero at most steps."""
+        r = self.config.randomisation
+        if not r.enabled or r.push_speed == 0.0:
+            return jnp.zeros(18)
+        draw = jax.random.uniform(key, (3,), minval=-1.0, maxval=1.0)
+        pushed = jnp.abs(draw[2]) < self.config.control_dt / r.push_interval
+        return jnp.zeros(18).at[:2].set(jnp.where(pushed, r.push_speed * draw[:2], 0.0))
+
+    def _randomise(self, key: jax.Array) -> Randomised:
+        r = self.config.randomisation
+        u = jax.random.uniform(key, (8,))
+
+        def between(limits: tuple[float, float], u: jax.Array, default: float) -> jax.Array:
+            return limits[0] + (limits[1] - limits[0]) * u if r.enabled else jnp.float32(default)
+
+        drift = jnp.array([r.map_drift, r.map_drift, r.height_drift]) * float(r.enabled)
+        return Randomised(
+            friction=between(r.friction, u[0], self.config.robot.foot_friction),
+            payload=between(r.payload, u[1], 0.0),
+            kp_factor=between(r.gain, u[2], 1.0),
+            kd_factor=between(r.gain, u[3], 1.0),
+            latency=jnp.round(between(r.latency, u[4], 0.0) / self.config.physics_dt).astype(jnp.int32),
+            map_offset=drift * (2.0 * u[5:8] - 1.0),
+        )
+
+    # --- judgement -------------------------------------------------------------------------------------------------------
+
+    def _feet_and_terrain(self, episode: Episode) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """Feet (L, 3) m in the heading frame at the trunk; z_ij (L, P) m; terrain heights (L, P) m in the world."""
+        sensors = tg.Sensors(episode.qpos[3:7], episode.qvel[3:6], episode.qpos[7:], episode.qvel[6:])
+        feet = self.core.feet(sensors)
+        heights = self._heights(episode, tg.frames.yaw(episode.qpos[3:7]), self.core.sample_points(feet))
+        return feet, feet[:, 2:] - heights, heights + episode.qpos[2]
+
+    def _reward_terms(self, before: Episode, after: Episode, below: jax.Array, around: jax.Array) -> dict[str, jax.Array]:
+        c = self.config.rewards
+        velocity, command = after.qvel[:2], after.command
+        walking = jnp.sum(jnp.square(command)) > 0.5
+        phases = tg.path.leg_phases(after.controller.phase)
+        swing = (phases > 0) & walking
+        near = self._rings <= c.terrain_ring + 1e-6
+        rise = jnp.maximum(jnp.max(around, axis=1) - after.lift_off, 0.0)
+        along = rewards.along(velocity @ command, c.speed_low, c.speed_high, literal=c.literal)
+        return {
+            "along": jnp.where(walking, along, rewards.standing(velocity, c.speed_low)),
+            "across": rewards.across(velocity, command),
+            "smooth": rewards.smooth(after.controller.desired, before.controller.desired),
+            "energy": rewards.energy(after.torque, after.qvel[6:], literal=c.literal),
+            "terrain": jnp.mean(rewards.terrain(~swing, below[:, near], c.gap_threshold, graded=c.terrain_graded)),
+            "height": jnp.mean(jnp.where(swing, rewards.height(after.controller.lift, rise, c.lift_threshold), 0.0)),
+            "yaw": -jnp.square(after.qvel[5]),
+            "tilt": -0.1 * jnp.sum(jnp.square(after.qvel[3:5])),
+        }
+
+    def _fell(self, episode: Episode, feet: jax.Array, below: jax.Array, around: jax.Array) -> jax.Array:
+        """Whether trunk or a knee hits the terrain, the trunk tilts too far, or a foot is in a gap."""
+        c = self.config
+        rotation = tg.frames.rotation(episode.qpos[3:7])
+        trunk = self.robot.trunk_points @ rotation.T
+        knees = self._knees(episode) @ rotation.T
+        points = jnp.concatenate([trunk, knees]) + episode.qpos[:3]
+        ground = jnp.maximum(terrains.height(self.bank, episode.terrain, points[:, :2]), episode.floor)
+        radius = np.concatenate([np.zeros(len(self.robot.trunk_points)), np.full(4, c.knee_radius)])
+        hit = jnp.any(points[:, 2] - radius < ground)
+        fell = hit | (rotation[2, 2] < c.min_up)
+        if c.end_in_gap:
+            top = jnp.max(around, axis=1)
+            over_gap = top - around[:, 0] > c.rewards.gap_threshold
+            low = below[:, 0] + around[:, 0] - self.robot.foot_radius < top - c.gap_depth
+            fell |= jnp.any(over_gap & low)
+        return fell
+
+    def _knees(self, episode: Episode) -> jax.Array:
+        """Knees (L, 3) m in the trunk's frame."""
+        thigh_only = self.core.geometry._replace(shank=np.zeros(4, np.float32))
+        return self.core.geometry.hip_position + tg.leg.forward(thigh_only, episode.qpos[7:].reshape(4, 3))
+
+    def _off_map(self, episode: Episode) -> jax.Array:
+        return jnp.max(jnp.abs(episode.qpos[:2])) > self.bank.half_extent - 0.15
+
+    def _share(self, level: jax.Array) -> jax.Array:
+        return level / max(self.levels - 1, 1)
+
+
+def check(config: EnvConfig) -> None:
+    """Raises ValueError on a configuration that makes no sense."""
+    if config.method not in METHODS:
+        raise ValueError(f"unknown method '{config.method}'; choose one of {', '.join(METHODS)}")
+    ratio = config.control_dt / config.physics_dt
+    if abs(ratio - round(ratio)) > 1e-6 or ratio < 1:
+        raise ValueError(f"control_dt={config.control_dt} must be a whole multiple of physics_dt={config.physics_dt}")
+    if len(config.curriculum.difficulty) != len(config.curriculum.depth) or not config.curriculum.depth:
+        raise ValueError("curriculum.difficulty and curriculum.depth must have the same number of levels, at least 1")
+
+
+def make_bank(config: EnvConfig) -> terrains.Bank:
+    """The bank of the configured terrain, instance k at level k % levels of the curriculum's ladder."""
+    t = config.terrain
+    return terrains.make_bank(t.kind, t.num_terrains, t.seed, config.curriculum.difficulty, t)
+
+
+def make_core(config: EnvConfig, robot: Robot) -> tg.Core:
+    """The controller core of a robot; the method decides what the TG may do and what the policy sees."""
+    settings = config.tg
+    if config.method == "fixed_height":
+        # Lee et al. 2020: the TG moves the feet up and down by a fixed height, the residuals do the rest.
+        import dataclasses
+
+        settings = dataclasses.replace(settings, step_length=0.0, lift_range=0.0)
+    f32 = functools.partial(np.asarray, dtype=np.float32)
+    # Canonical axes are +x, -y, -y.
+    sign = robot.axis_sign[0] * np.array([1.0, -1.0, -1.0])
+    geometry = tg.LegGeometry(*map(f32, (robot.hip_position, robot.hip_offset, robot.thigh, robot.shank, sign)))
+    return tg.Core(
+        settings,
+        geometry,
+        base_foot=f32(robot.base_foot),
+        default_pose=f32(robot.default_pose),
+        lower=f32(robot.joint_lower),
+        upper=f32(robot.joint_upper),
+        dt=config.control_dt,
+        sag=float(robot.mass * 9.81 / config.robot.kp),
+        heights=config.method != "blind",
+    )

@@ -1,0 +1,1 @@
+"""Robot models, one module each, built from figures with primitives only."""
