@@ -1,0 +1,256 @@
+"""The configuration of a training run, and what turns a command line into one.
+
+Each room's defaults stand in its own dataclass; Hydra's groups `terrain` and `method` only name a choice.
+"""
+
+import dataclasses
+import difflib
+import os
+import sys
+import time
+import types
+import typing
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from tlq.networks import NetworkConfig
+from tlq.ppo import PPOConfig
+
+METHODS = ("ours", "fixed_height", "blind")
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainConfig:
+    """A training run: what a user sets on the command line of train.py."""
+
+    env: Any = None
+    """The environment (`envs.EnvConfig`); `terrain=` and `method=` set its main choices."""
+    policy: NetworkConfig = dataclasses.field(default_factory=NetworkConfig)
+    """Sizes of policy and critic."""
+    ppo: PPOConfig = dataclasses.field(default_factory=PPOConfig)
+    """Settings of the update."""
+    num_envs: int = 1024
+    """Environments B over all devices."""
+    steps: int = 10_000_000
+    """Environment steps after which the run is complete; written 2e6 or 2_000_000."""
+    seed: int = 0
+    """Seed of everything random in training; the terrains have their own (`env.terrain.seed`)."""
+    run: str = ""
+    """Folder of the run; default runs/<terrain>-<method>-<date-time>."""
+    resume: bool = False
+    """Go on with the run in that folder, with the settings it was started with."""
+    init: str = ""
+    """Run folder or policy file whose parameters and normaliser to start from."""
+    devices: int = 0
+    """Devices to use; 0: all of them."""
+    checkpoint_every: float = 300.0
+    """Seconds between checkpoints."""
+    keep: int = 3
+    """Checkpoints kept."""
+    log_every: float = 10.0
+    """Seconds between lines of text."""
+    cache: str = "~/.cache/tlq/jax"
+    """Folder of JAX's compilation cache; empty: none."""
+
+
+class ConfigError(ValueError):
+    """A setting that doesn't exist or isn't valid; the text names the valid ones."""
+
+
+def default_config() -> TrainConfig:
+    """All defaults, the environment's included."""
+    import envs
+
+    return TrainConfig(env=envs.EnvConfig())
+
+
+def make(name: str = "poles", *, num_terrains: int | None = None, method: str = "ours", **overrides: Any) -> Any:
+    """The quadruped on a kind of terrain, as a Brax environment (one instance, no auto-reset).
+
+    overrides: other fields of `envs.EnvConfig` by name; nested ones with __ for the dot, e.g. tg__step_length=0.25.
+    """
+    import envs
+
+    values = {"terrain.kind": name, "method": method, **{k.replace("__", "."): v for k, v in overrides.items()}}
+    if num_terrains is not None:
+        values["terrain.num_terrains"] = num_terrains
+    config = envs.EnvConfig()
+    for key, value in values.items():
+        config = replace(config, key, value)
+    return envs.make(config)
+
+
+def replace(config: Any, key: str, value: Any) -> Any:
+    """Copy of a nested dataclass with the field at a dotted key set."""
+    name, _, rest = key.partition(".")
+    known = [f.name for f in dataclasses.fields(config)]
+    if name not in known:
+        raise ConfigError(_unknown("setting", name, known))
+    return dataclasses.replace(config, **{name: replace(getattr(config, name), rest, value) if rest else value})
+
+
+# -- Hydra -----------------------------------------------------------------------------------------------------------
+
+
+def register() -> None:
+    """Makes the schema and the choices of the groups known to Hydra."""
+    import terrains
+    from hydra.core.config_store import ConfigStore
+    from omegaconf import OmegaConf
+
+    store = ConfigStore.instance()
+    schema = OmegaConf.structured(default_config())
+    _writable(schema)
+    store.store(name="schema", node=schema, provider="tlq")
+    for kind in terrains.kinds():
+        store.store(group="terrain", name=kind, node={"kind": kind}, package="env.terrain", provider="tlq")
+    for method in METHODS:
+        store.store(group="method", name=method, node={"method": method}, package="env", provider="tlq")
+
+
+def _writable(node: Any) -> None:
+    """Frozen dataclasses become read-only nodes, which Hydra couldn't override."""
+    from omegaconf import DictConfig, OmegaConf
+
+    OmegaConf.set_readonly(node, False)
+    if isinstance(node, DictConfig) and not node._is_none():
+        for key in node:
+            child = node._get_node(key)
+            if isinstance(child, DictConfig):
+                _writable(child)
+
+
+def check(arguments: Sequence[str]) -> None:
+    """Raises ConfigError, one line that names the valid choices, where Hydra would answer with pages."""
+    import terrains
+
+    choices = {"terrain": terrains.kinds(), "method": METHODS}
+    schema = default_config()
+    for argument in arguments:
+        key, equals, value = argument.partition("=")
+        if argument.startswith("-") or key.startswith(("hydra", "+", "~")):
+            continue
+        if not equals:
+            raise ConfigError(f"'{argument}' isn't of the form key=value, e.g. terrain=poles")
+        if key in choices:
+            for name in value.split(","):
+                if name not in choices[key]:
+                    raise ConfigError(_unknown(key, name, choices[key]))
+            continue
+        node: Any = schema
+        for i, name in enumerate(key.split(".")):
+            known = [f.name for f in dataclasses.fields(node)] if dataclasses.is_dataclass(node) else []
+            if name not in known:
+                raise ConfigError(_unknown("setting", key, [*choices, *known] if i == 0 else known))
+            node = getattr(node, name)
+
+
+def _unknown(what: str, name: str, known: Sequence[str]) -> str:
+    close = difflib.get_close_matches(name.rpartition(".")[2], known, n=1)
+    hint = f" (did you mean {close[0]}?)" if close else ""
+    return f"unknown {what} '{name}'{hint}; choose one of {', '.join(known)}"
+
+
+def from_hydra(node: Any, overrides: Sequence[str] = ()) -> TrainConfig:
+    """Typed configuration from what Hydra composed; overrides: the command line, needed for `resume`."""
+    from omegaconf import OmegaConf
+
+    data = OmegaConf.to_container(node, resolve=True)
+    if data["resume"]:
+        data = _resumed(data, overrides)
+    config = build(TrainConfig, data)
+    validate(config)
+    return config if config.run else dataclasses.replace(config, run=default_run(config))
+
+
+def _resumed(data: dict[str, Any], overrides: Sequence[str]) -> dict[str, Any]:
+    """The settings a run was started with, changed by those given on the command line."""
+    from omegaconf import OmegaConf
+
+    path = Path(data["run"]) / "config.yaml"
+    if not data["run"] or not path.exists():
+        raise ConfigError(f"run={data['run']} holds no run to resume")
+    saved = OmegaConf.to_container(OmegaConf.load(path))
+    groups = {"terrain": saved["env"]["terrain"]["kind"], "method": saved["env"]["method"]}
+    for override in overrides:
+        key, _, value = override.partition("=")
+        if groups.get(key, value) != value:
+            raise ConfigError(f"{path} has {key}={groups[key]}; to train it further on another one, use init={data['run']}")
+        if key in groups:
+            continue
+        new, old = data, saved
+        *parents, last = key.split(".")
+        for name in parents:
+            new, old = new[name], old[name]
+        old[last] = new[last]
+    return saved
+
+
+def build(cls: Any, data: dict[str, Any]) -> Any:
+    """Nested frozen dataclass from a nested dict; lists become tuples, so that configurations can be hashed."""
+    hints = typing.get_type_hints(cls)
+    defaults = {f.name: f for f in dataclasses.fields(cls)}
+    unknown = [k for k in data if k not in defaults]
+    if unknown:
+        raise ConfigError(_unknown("setting", unknown[0], list(defaults)))
+    values = {}
+    for name, value in data.items():
+        kind = hints[name]
+        if isinstance(kind, types.UnionType) or typing.get_origin(kind) is typing.Union:
+            kind = next(k for k in typing.get_args(kind) if k is not type(None))
+        if cls is TrainConfig and name == "env":
+            import envs
+
+            kind = envs.EnvConfig
+        values[name] = build(kind, value) if isinstance(value, dict) and dataclasses.is_dataclass(kind) else _tuples(value)
+    return cls(**values)
+
+
+def _tuples(value: Any) -> Any:
+    return tuple(_tuples(v) for v in value) if isinstance(value, list) else value
+
+
+def validate(config: TrainConfig) -> None:
+    """Raises ConfigError for values that no type excludes."""
+    from tlq.memory import KINDS
+
+    if config.policy.memory not in KINDS:
+        raise ConfigError(_unknown("policy.memory", config.policy.memory, KINDS))
+    for key in ("num_envs", "steps", "keep"):
+        if getattr(config, key) <= 0:
+            raise ConfigError(f"{key}={getattr(config, key)} must be positive")
+    if config.num_envs % config.ppo.minibatches:
+        raise ConfigError(f"num_envs={config.num_envs} must be a multiple of ppo.minibatches={config.ppo.minibatches}")
+
+
+def default_run(config: TrainConfig) -> str:
+    return f"runs/{config.env.terrain.kind}-{config.env.method}-{time.strftime('%Y%m%d-%H%M%S')}"
+
+
+def save_config(config: TrainConfig, path: Path) -> None:
+    """Writes the resolved configuration as YAML."""
+    from omegaconf import OmegaConf
+
+    OmegaConf.save(OmegaConf.create(dataclasses.asdict(config)), path)
+
+
+def load_config(path: Path) -> TrainConfig:
+    """Reads what `save_config` wrote."""
+    from omegaconf import OmegaConf
+
+    return build(TrainConfig, OmegaConf.to_container(OmegaConf.load(path)))
+
+
+def use_cache(folder: str) -> None:
+    """Turns on JAX's persistent compilation cache."""
+    import jax
+
+    if folder:
+        jax.config.update("jax_compilation_cache_dir", os.path.expanduser(folder))
+
+
+def fail(error: Exception) -> typing.NoReturn:
+    """One line and exit code 1."""
+    print(f"error: {' '.join(str(error).split())}", file=sys.stderr, flush=True)
+    sys.exit(1)

@@ -1,0 +1,180 @@
+"""Policy and critic (Flax linen), the action distribution, and the factory that Brax's PPO loss expects.
+
+Letters: B environments, T time, A = 14 actions, C size of the carry, S and V sizes of 'state' and
+'privileged_state'. 'state' is [proprioception | heights of 4 feet x 25 points], the heights already scaled.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from brax.training.acme.running_statistics import NestedMeanStd
+from brax.training.acme.running_statistics import normalize as normalise
+from brax.training.agents.ppo.networks import PPONetworks
+from brax.training.distribution import NormalTanhDistribution
+from brax.training.networks import FeedForwardNetwork
+from flax import linen as nn
+
+from tlq.memory import Dense, Memory, carry_size
+
+CLIP = 10.0  # normalised observations are clipped to +-CLIP standard deviations
+MIN_STD = 0.001
+
+
+@dataclasses.dataclass(frozen=True)
+class NetworkConfig:
+    """Sizes of policy and critic."""
+
+    memory: str = "mingru"
+    """Memory cell: mingru, gru or none."""
+    memory_layers: int = 2
+    """Recurrent layers."""
+    memory_width: int = 64
+    """Width of a recurrent layer."""
+    encoder: int = 128
+    """Width of the proprioceptive encoder and of the layer that mixes it with the feet."""
+    foot_encoder: tuple[int, int] = (32, 16)
+    """Widths of the encoder of one foot's heights; its weights are shared by the four feet."""
+    head: int = 64
+    """Width of the layer before the action."""
+    critic: tuple[int, ...] = (128, 128)
+    """Hidden widths of the critic."""
+    initial_std: float = 0.3
+    """Standard deviation of the action, before tanh, of an untrained policy."""
+    feet: int = 4
+    """Feet whose heights stand at the end of the observation."""
+
+
+class RecurrentNormalTanh(NormalTanhDistribution):
+    """Squashed normal over 'action' whose samples also hand the memory on: {'action': (.., A), 'carry': (B, C)}.
+
+    Parameters are {'action': (.., 2 A) means and raw scales, 'carry': (B, C)}. Only 'action' enters the density.
+    """
+
+    def create_dist(self, parameters: dict[str, jax.Array]) -> Any:
+        return super().create_dist(parameters["action"])
+
+    def sample_no_postprocessing(self, parameters: dict[str, jax.Array], seed: jax.Array) -> dict[str, jax.Array]:
+        return {"action": self.create_dist(parameters).sample(seed), "carry": parameters["carry"]}
+
+    def mode(self, parameters: dict[str, jax.Array]) -> dict[str, jax.Array]:
+        return self.postprocess({"action": self.create_dist(parameters).mode(), "carry": parameters["carry"]})
+
+    def postprocess(self, event: dict[str, jax.Array]) -> dict[str, jax.Array]:
+        return dict(event, action=super().postprocess(event["action"]))
+
+    def inverse_postprocess(self, event: dict[str, jax.Array]) -> dict[str, jax.Array]:
+        return dict(event, action=super().inverse_postprocess(event["action"]))
+
+    def log_prob(self, parameters: dict[str, jax.Array], actions: dict[str, jax.Array]) -> jax.Array:
+        return super().log_prob(parameters, actions["action"])
+
+
+def _head_bias(initial_std: float) -> Callable[..., jax.Array]:
+    """Bias of [mean | raw scale]: mean 0 and softplus(raw) + MIN_STD = initial_std."""
+
+    def init(key: jax.Array, shape: tuple[int, ...], dtype: Any = jnp.float32) -> jax.Array:
+        half = shape[0] // 2
+        return jnp.concatenate([jnp.zeros(half), jnp.full(half, jnp.log(jnp.expm1(initial_std - MIN_STD)))]).astype(dtype)
+
+    return init
+
+
+class Policy(nn.Module):
+    """Encoders, memory, head: normalised proprioception and heights -> parameters of the action distribution."""
+
+    config: NetworkConfig
+    action_size: int
+
+    @nn.compact
+    def __call__(
+        self, proprio: jax.Array, heights: jax.Array | None, carry: jax.Array, is_first: jax.Array
+    ) -> dict[str, jax.Array]:
+        """proprio (.., S - 100), heights (.., 100) or None, carry (B, C) from before the first step, is_first (.., 1);
+        .. is (B,) for a step, (T, B) for a scan.
+
+        Returns {'action': (.., 2 A), 'carry': (B, C) after the last step}.
+        """
+        c = self.config
+        x = nn.elu(Dense(c.encoder, name="proprio")(proprio))
+        if heights is not None:
+            foot = heights.reshape(*heights.shape[:-1], c.feet, heights.shape[-1] // c.feet)
+            for i, width in enumerate(c.foot_encoder):
+                foot = nn.elu(Dense(width, name=f"foot_{i}")(foot))
+            # The feet are told apart here: each has its own place in the input of `mix`.
+            x = jnp.concatenate([x, foot.reshape(*x.shape[:-1], -1)], axis=-1)
+        x = nn.elu(Dense(c.encoder, name="mix")(x))
+        y = Dense(c.memory_width, name="to_memory")(x)
+        carry, y = Memory(c.memory, c.memory_layers, c.memory_width, name="memory")(carry, y, is_first)
+        # x skips the memory, so that reflexes don't have to pass through it.
+        y = nn.elu(Dense(c.head, name="head")(jnp.concatenate([x, y], axis=-1)))
+        small = nn.initializers.variance_scaling(0.01**2, "fan_in", "truncated_normal")
+        out = Dense(2 * self.action_size, kernel_init=small, bias_init=_head_bias(c.initial_std), name="action")
+        return {"action": out(y), "carry": carry}
+
+
+class Critic(nn.Module):
+    """Value of the normalised 'privileged_state' (.., V) -> (..)."""
+
+    widths: tuple[int, ...]
+
+    @nn.compact
+    def __call__(self, privileged_state: jax.Array) -> jax.Array:
+        x = privileged_state
+        for i, width in enumerate(self.widths):
+            x = nn.elu(Dense(width, name=f"hidden_{i}")(x))
+        return Dense(1, name="value")(x)[..., 0]
+
+
+def _size(shape: Any) -> int:
+    return shape if isinstance(shape, int) else shape[-1]
+
+
+def _normalised(preprocess: Callable[..., Any], statistics: Any, obs: dict[str, jax.Array], key: str) -> jax.Array:
+    if preprocess is not normalise:  # Brax's identity takes whatever it is given
+        return preprocess(obs, statistics)[key]
+    part = NestedMeanStd(mean={key: statistics.mean[key]}, std={key: statistics.std[key]})
+    return preprocess({key: obs[key]}, part, max_abs_value=CLIP)[key]
+
+
+def make_networks(
+    observation_size: dict[str, Any],
+    action_size: int,
+    preprocess_observations_fn: Callable[..., Any] = normalise,
+    *,
+    config: NetworkConfig = NetworkConfig(),
+    heights: int = 100,
+) -> PPONetworks:
+    """Network factory with Brax's signature.
+
+    observation_size: {'state': S, 'privileged_state': V, ...}, each a number or a shape. `heights`: how many of the
+    last entries of 'state' are terrain heights (0 for the blind policy); they are not normalised.
+    """
+    state_size, value_size = _size(observation_size["state"]), _size(observation_size["privileged_state"])
+    size = carry_size(config.memory, config.memory_layers, config.memory_width)
+    policy, critic = Policy(config, action_size), Critic(config.critic)
+
+    def split(state: jax.Array) -> tuple[jax.Array, jax.Array | None]:
+        proprio = state_size - heights
+        return state[..., :proprio], state[..., proprio:] if heights else None
+
+    def policy_init(key: jax.Array) -> Any:
+        return policy.init(key, *split(jnp.zeros((1, state_size))), jnp.zeros((1, size)), jnp.zeros((1, 1)))
+
+    def policy_apply(statistics: Any, params: Any, obs: dict[str, jax.Array]) -> dict[str, jax.Array]:
+        proprio, _ = split(_normalised(preprocess_observations_fn, statistics, obs, "state"))
+        carry = obs["carry"] if proprio.ndim == 2 else obs["carry"][0]
+        return policy.apply(params, proprio, split(obs["state"])[1], carry, obs["is_first"])
+
+    def value_apply(statistics: Any, params: Any, obs: dict[str, jax.Array]) -> jax.Array:
+        return critic.apply(params, _normalised(preprocess_observations_fn, statistics, obs, "privileged_state"))
+
+    return PPONetworks(
+        policy_network=FeedForwardNetwork(init=policy_init, apply=policy_apply),
+        value_network=FeedForwardNetwork(
+            init=lambda key: critic.init(key, jnp.zeros((1, value_size))), apply=value_apply
+        ),
+        parametric_action_distribution=RecurrentNormalTanh(event_size=action_size, min_std=MIN_STD),
+    )

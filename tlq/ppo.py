@@ -1,0 +1,304 @@
+"""Recurrent PPO (arXiv 1707.06347) on Brax's loss, running statistics and environments: our own loop around them.
+
+Letters: B environments, T = unroll steps, M minibatches. One call of `Learner.step` is one iteration: T steps of
+every environment, then `epochs` passes over M minibatches. Environments are split over the devices of a mesh axis
+'data'; gradients and statistics are averaged over it, everything but the environments is replicated.
+"""
+
+import dataclasses
+import functools
+from typing import Any
+
+import flax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from brax.envs.base import Env, State
+from brax.training.acme import running_statistics
+from brax.training.agents.ppo.losses import PPONetworkParams, compute_ppo_loss
+from brax.training.agents.ppo.networks import PPONetworks
+from brax.training.types import Transition
+from jax.sharding import Mesh, NamedSharding
+from jax.sharding import PartitionSpec as P
+
+AXIS = "data"
+NORMALISED = ("state", "privileged_state")
+
+
+@dataclasses.dataclass(frozen=True)
+class PPOConfig:
+    """Settings of the update."""
+
+    unroll: int = 40
+    """Steps T of each environment per iteration; 40 steps are one gait cycle at 1.25 Hz."""
+    epochs: int = 2
+    """Passes over the data of an iteration."""
+    minibatches: int = 4
+    """Gradient steps of a pass; each takes B / minibatches whole pieces of T steps."""
+    discount: float = 0.99
+    """Discount of a step."""
+    gae_lambda: float = 0.95
+    """Lambda of the advantage estimate."""
+    clip: float = 0.2
+    """Clipping range of the probability ratio."""
+    learning_rate: float = 3e-4
+    """Adam's learning rate at the start."""
+    learning_rate_min: float = 1e-5
+    """Lower bound of the adaptive learning rate."""
+    learning_rate_max: float = 1e-3
+    """Upper bound of the adaptive learning rate."""
+    kl_target: float = 0.01
+    """KL(old, new) of an iteration that the learning rate is steered to; 0 keeps the learning rate."""
+    entropy: float = 3e-3
+    """Weight of the entropy bonus."""
+    value_loss: float = 0.5
+    """Weight of the value loss (which has a factor 1/2 of its own)."""
+    max_grad_norm: float = 1.0
+    """The gradient is scaled down to this norm."""
+    reward_scaling: float = 1.0
+    """Factor on the reward."""
+
+
+@flax.struct.dataclass
+class TrainState:
+    """All that an iteration reads and changes."""
+
+    params: PPONetworkParams
+    opt_state: Any
+    learning_rate: jax.Array  # ()
+    normaliser: running_statistics.RunningStatisticsState  # of 'state' (S,) and 'privileged_state' (V,)
+    env_state: State  # every leaf (B, ...)
+    key: jax.Array  # (2,) uint32
+    iteration: jax.Array  # () int32
+
+
+@flax.struct.dataclass
+class Rollout:
+    """What the loss reads of T steps of B environments."""
+
+    observation: dict[str, jax.Array]  # 'state' (T, B, S), 'privileged_state' (T, B, V), 'is_first' (T, B, 1)
+    action: jax.Array  # (T, B, A) before tanh
+    log_prob: jax.Array  # (T, B)
+    parameters: jax.Array  # (T, B, 2 A) of the distribution that drew the action
+    reward: jax.Array  # (T, B)
+    done: jax.Array  # (T, B)
+    truncation: jax.Array  # (T, B)
+
+
+def make_mesh(num_devices: int = 0) -> Mesh:
+    """Mesh over the first `num_devices` devices (0: all of them), with the axis 'data'."""
+    devices = jax.devices()
+    return Mesh(np.array(devices[: num_devices or len(devices)]), (AXIS,))
+
+
+def adapt_learning_rate(rate: jax.Array, kl: jax.Array, config: PPOConfig) -> jax.Array:
+    """Halves the rate above twice the target KL, raises it by 1.5 below half of it, within its bounds."""
+    if config.kl_target <= 0:
+        return rate
+    factor = jnp.where(kl > 2 * config.kl_target, 0.5, jnp.where(kl < config.kl_target / 2, 1.5, 1.0))
+    return jnp.clip(rate * factor, config.learning_rate_min, config.learning_rate_max)
+
+
+class Learner:
+    """PPO of one environment and one pair of networks.
+
+    env: batched, with the carry in its observation (`RecurrentWrapper`). num_envs: B over all devices.
+    """
+
+    def __init__(self, env: Env, networks: PPONetworks, config: PPOConfig, num_envs: int, mesh: Mesh | None = None):
+        self.env, self.networks, self.config, self.num_envs = env, networks, config, num_envs
+        self.mesh = mesh or make_mesh()
+        self.devices = self.mesh.devices.size
+        if num_envs % (self.devices * config.minibatches):
+            raise ValueError(
+                f"num_envs={num_envs} must be a multiple of devices x minibatches = "
+                f"{self.devices} x {config.minibatches}"
+            )
+        self.steps_per_iteration = num_envs * config.unroll
+        self._optimiser = optax.chain(optax.clip_by_global_norm(config.max_grad_norm), optax.scale_by_adam(eps=1e-5))
+        self._loss = functools.partial(
+            compute_ppo_loss,
+            ppo_network=networks,
+            entropy_cost=config.entropy,
+            discounting=config.discount,
+            reward_scaling=config.reward_scaling,
+            gae_lambda=config.gae_lambda,
+            clipping_epsilon=config.clip,
+            vf_coefficient=config.value_loss,
+        )
+        self.specs = TrainState(P(), P(), P(), P(), P(AXIS), P(), P())
+        # Nothing is donated: the state before an update stays whole, so that a failed one can be saved and replayed.
+        # That costs one env_state; the rollout, which is ten times larger, lives inside the call.
+        self.step = jax.jit(
+            jax.shard_map(
+                self._iteration, mesh=self.mesh, in_specs=(self.specs,), out_specs=(self.specs, P()), check_vma=False
+            )
+        )
+
+    # -- state ---------------------------------------------------------------------------------------------------------
+
+    def init(self, seed: int) -> TrainState:
+        """State before the first iteration, placed on the mesh."""
+        return jax.jit(self._init, out_shardings=self.shardings())(jax.random.PRNGKey(seed))
+
+    def shardings(self) -> TrainState:
+        """Sharding of every part of the state."""
+        return jax.tree.map(lambda spec: NamedSharding(self.mesh, spec), self.specs, is_leaf=lambda x: isinstance(x, P))
+
+    def _init(self, key: jax.Array) -> TrainState:
+        key, key_env, key_policy, key_value = jax.random.split(key, 4)
+        env_state = self.env.reset(jax.random.split(key_env, self.num_envs))
+        params = PPONetworkParams(
+            policy=self.networks.policy_network.init(key_policy), value=self.networks.value_network.init(key_value)
+        )
+        # std_eps: an observation that hardly varies isn't blown up (least standard deviation 0.01).
+        seen = {name: jnp.zeros(env_state.obs[name].shape[1:]) for name in NORMALISED}
+        state = TrainState(
+            params=params,
+            opt_state=self._optimiser.init(params),
+            learning_rate=jnp.float32(self.config.learning_rate),
+            normaliser=running_statistics.init_state(seen, std_eps=1e-4),
+            env_state=env_state,
+            key=key,
+            iteration=jnp.int32(0),
+        )
+        # Strong types throughout: with a weak one in the environment's state the second call would compile again.
+        return jax.tree.map(lambda x: jax.lax.convert_element_type(x, jnp.asarray(x).dtype), state)
+
+    # -- one iteration, on each device ---------------------------------------------------------------------------------
+
+    def _iteration(self, state: TrainState) -> tuple[TrainState, dict[str, jax.Array]]:
+        key, key_here = jax.random.split(state.key)
+        key_rollout, key_update = jax.random.split(jax.random.fold_in(key_here, jax.lax.axis_index(AXIS)))
+        start = state.env_state.obs
+        env_state, rollout, env_metrics = self._rollout(state, key_rollout)
+        params, opt_state, losses = self._update(state, start["carry"], rollout, env_state.obs, key_update)
+        # Statistics move after the gradient steps, so that the first ratio of new to old probability is 1.
+        # A quarter of the steps says the same at a quarter of the cost.
+        normaliser = running_statistics.update(
+            state.normaliser, {k: rollout.observation[k][::4] for k in NORMALISED}, pmap_axis_name=AXIS
+        )
+        # The very first iteration only looks: a policy isn't trained on observations that aren't normalised yet.
+        looking = (state.normaliser.count.hi == 0) & (state.normaliser.count.lo == 0)
+        params, opt_state = jax.tree.map(
+            lambda old, new: jnp.where(looking, old, new), (state.params, state.opt_state), (params, opt_state)
+        )
+        kl = jnp.where(looking, self.config.kl_target, losses["kl_last"])
+        new_state = TrainState(
+            params=params,
+            opt_state=opt_state,
+            learning_rate=adapt_learning_rate(state.learning_rate, kl, self.config),
+            normaliser=normaliser,
+            env_state=env_state,
+            key=key,
+            iteration=state.iteration + 1,
+        )
+        return new_state, {**env_metrics, **losses, "learning_rate": state.learning_rate}
+
+    def _rollout(self, state: TrainState, key: jax.Array) -> tuple[State, Rollout, dict[str, jax.Array]]:
+        """T steps with sampled actions; metrics are sums over T and means over B, see `summarise`."""
+        policy, distribution = self.networks.policy_network, self.networks.parametric_action_distribution
+
+        def step(env_state: State, key: jax.Array):
+            obs = env_state.obs
+            parameters = policy.apply(state.normaliser, state.params.policy, obs)
+            raw = distribution.sample_no_postprocessing(parameters, key)
+            after = self.env.step(env_state, distribution.postprocess(raw))
+            rollout = Rollout(
+                observation={k: obs[k] for k in (*NORMALISED, "is_first")},
+                action=raw["action"],
+                log_prob=distribution.log_prob(parameters, raw),
+                parameters=parameters["action"],
+                reward=after.reward,
+                done=after.done,
+                truncation=after.info["truncation"],
+            )
+            metrics = {k: jnp.mean(v) for k, v in after.metrics.items()}
+            return after, (rollout, dict(metrics, reward=jnp.mean(after.reward)))
+
+        env_state, (rollout, metrics) = jax.lax.scan(
+            step, state.env_state, jax.random.split(key, self.config.unroll)
+        )
+        metrics = jax.tree.map(lambda x: jax.lax.pmean(jnp.mean(x, axis=0), AXIS), metrics)
+        return env_state, rollout, summarise(metrics, self.steps_per_iteration)
+
+    def _update(self, state: TrainState, carry: jax.Array, rollout: Rollout, last: dict[str, jax.Array], key: jax.Array):
+        """`epochs` passes of gradient steps; carry (B, C) before the first step, `last` observation after the last."""
+        c = self.config
+        envs = rollout.reward.shape[1]
+        key_order, key_loss = jax.random.split(key)
+        orders = jax.vmap(lambda k: jax.random.permutation(k, envs))(jax.random.split(key_order, c.epochs))
+        chosen = orders.reshape(c.epochs * c.minibatches, envs // c.minibatches)
+
+        def gradient_step(carried, inputs):
+            params, opt_state = carried
+            index, key = inputs
+            batch = as_transition(jax.tree.map(lambda x: x[:, index], rollout), carry[index], last["privileged_state"][index])
+            (_, losses), grads = jax.value_and_grad(self._loss, has_aux=True)(params, state.normaliser, batch, key)
+            grads, losses = jax.lax.pmean((grads, losses), AXIS)
+            updates, opt_state = self._optimiser.update(grads, opt_state)
+            params = optax.apply_updates(params, jax.tree.map(lambda u: -state.learning_rate * u, updates))
+            return (params, opt_state), dict(losses, grad_norm=optax.global_norm(grads))
+
+        (params, opt_state), losses = jax.lax.scan(
+            gradient_step,
+            (state.params, state.opt_state),
+            (chosen, jax.random.split(key_loss, c.epochs * c.minibatches)),
+        )
+        return params, opt_state, _loss_metrics(losses, c.minibatches)
+
+
+def as_transition(rollout: Rollout, carry: jax.Array, last_privileged: jax.Array) -> Transition:
+    """A rollout in the form, and with the leading axes [B, T], that Brax's loss takes.
+
+    The loss reads the carry of the first step and the next observation of the last step only, so those are all there
+    is. It swaps the axes back at once; the compiler removes both swaps.
+    """
+    data = Transition(
+        observation=dict(rollout.observation, carry=carry[None]),
+        action=(),
+        reward=rollout.reward,
+        discount=1 - rollout.done,
+        next_observation={"privileged_state": last_privileged[None]},
+        extras={
+            "state_extras": {"truncation": rollout.truncation},
+            "policy_extras": {
+                "raw_action": {"action": rollout.action},
+                "log_prob": rollout.log_prob,
+                "distribution_params": {"action": rollout.parameters},
+            },
+        },
+    )
+    return jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), data)
+
+
+def summarise(means: dict[str, jax.Array], steps: int) -> dict[str, jax.Array]:
+    """Figures of an iteration from the means over its `steps` steps of the environment's metrics.
+
+    What an environment reports as 'episode/<x>' is zero but at an episode's end, so a mean over episodes is a ratio
+    of two means over steps. Without an episode's end the ratios are nan.
+    """
+    ended = means.get("episode/ended", jnp.float32(0))
+    figures = {k: v for k, v in means.items() if not k.startswith("episode/")}
+    for key, value in means.items():
+        if key.startswith("episode/") and key != "episode/ended":
+            figures[key] = value / ended
+    return dict(figures, episodes=ended * steps)
+
+
+def _loss_metrics(losses: dict[str, jax.Array], minibatches: int) -> dict[str, jax.Array]:
+    """Means over the gradient steps (each (epochs x minibatches,)); `kl_last` over the last pass."""
+    names = {
+        "policy_loss": "loss/policy",
+        "v_loss": "loss/value",
+        "entropy_loss": "loss/entropy",
+        "total_loss": "loss/total",
+        "grad_norm": "loss/grad_norm",
+        "policy_dist_mean_std": "std",
+        "policy_dist_max_std": "std_max",
+    }
+    figures = {new: jnp.mean(losses[old]) for old, new in names.items()}
+    finite = jnp.isfinite(losses["total_loss"]) & jnp.isfinite(losses["grad_norm"])
+    kl = losses["kl_mean"]
+    return dict(figures, kl=jnp.mean(kl), kl_last=jnp.mean(kl[-minibatches:]), finite=jnp.all(finite))

@@ -1,0 +1,199 @@
+"""A training run: environment, networks and PPO put together, and the folder that a run leaves behind.
+
+    run/config.yaml  metrics.csv  events.*  curve.png  policy.npz  checkpoints/  failed/ (after a failed update)
+"""
+
+import contextlib
+import signal
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from brax.envs.base import Env
+from brax.envs.wrappers.training import VmapWrapper
+
+from tlq import memory
+from tlq.checkpoint import Checkpoints, names, read_arrays
+from tlq.config import TrainConfig, save_config
+from tlq.logger import Logger
+from tlq.networks import make_networks
+from tlq.ppo import Learner, TrainState, make_mesh
+
+
+class TrainingFailed(RuntimeError):
+    """An update wasn't finite; the text says what was saved where."""
+
+
+def wrap(env: Env, config: TrainConfig) -> Env:
+    """Batched environment with the policy's memory in its observation; `env` is one that resets itself."""
+    c = config.policy
+    return memory.RecurrentWrapper(VmapWrapper(env), memory.carry_size(c.memory, c.memory_layers, c.memory_width))
+
+
+def make_learner(config: TrainConfig, env: Env | None = None, heights: int | None = None) -> Learner:
+    """Learner of `config`; env: a single auto-resetting instance, by default the quadruped of `config.env`."""
+    if env is None:
+        import envs
+
+        env = envs.AutoReset(envs.make(config.env))
+    if heights is None:
+        heights = 0 if config.env.method == "blind" else 100
+    networks = make_networks(env.observation_size, env.action_size, config=config.policy, heights=heights)
+    return Learner(wrap(env, config), networks, config.ppo, config.num_envs, make_mesh(config.devices))
+
+
+def train(config: TrainConfig, env: Env | None = None, heights: int | None = None) -> dict[str, float]:
+    """Runs or resumes a training run in `config.run`; returns the figures of its last iteration."""
+    folder = open_folder(config)
+    learner = make_learner(config, env, heights)
+    state = learner.init(config.seed)
+    checkpoints = Checkpoints(folder / "checkpoints", config.keep)
+    if config.resume:
+        state, _ = checkpoints.restore(state)
+    elif config.init:
+        state = initialise(state, config.init)
+    if not config.resume:
+        save_config(config, folder / "config.yaml")
+    logger = Logger(folder, config.steps, int(state.iteration), config.log_every)
+    try:
+        return _loop(config, learner, state, checkpoints, logger)
+    finally:
+        logger.close()
+        checkpoints.close()
+
+
+def _loop(
+    config: TrainConfig, learner: Learner, state: TrainState, checkpoints: Checkpoints, logger: Logger
+) -> dict[str, float]:
+    iteration = int(state.iteration)  # a Python int, so that the count of steps can't overflow
+    figures: dict[str, float] = {}
+    saved_at = time.monotonic()
+    saved = iteration if config.resume else None
+    with _stop_on_signals() as stop:
+        while iteration * learner.steps_per_iteration < config.steps and not stop:
+            began = time.monotonic()
+            before = state
+            state, metrics = learner.step(before)
+            measured = {k: float(v) for k, v in jax.device_get(metrics).items()}
+            iteration += 1
+            if not measured.pop("finite"):
+                raise TrainingFailed(save_failed(config, before, iteration))
+            figures = {
+                "iteration": float(iteration),
+                "env_steps": float(iteration * learner.steps_per_iteration),
+                "steps_per_second": learner.steps_per_iteration / (time.monotonic() - began),
+                **measured,
+            }
+            if jax.process_index() == 0:
+                logger.write(figures)
+            if _agree(time.monotonic() - saved_at > config.checkpoint_every):
+                save(config, learner, state, checkpoints, logger)
+                saved_at, saved = time.monotonic(), iteration
+            if _agree(bool(stop)) and not stop:
+                stop.append(0)
+    if saved != iteration:
+        save(config, learner, state, checkpoints, logger)
+    if stop:
+        print(f"stopped at {iteration * learner.steps_per_iteration} steps; go on with run={config.run} resume=true")
+    return figures
+
+
+def save(config: TrainConfig, learner: Learner, state: TrainState, checkpoints: Checkpoints, logger: Logger) -> None:
+    """Checkpoint, exported policy and picture of the run so far."""
+    iteration = int(state.iteration)
+    checkpoints.save(iteration, state, {"env_steps": iteration * learner.steps_per_iteration, "seed": config.seed})
+    if jax.process_index() == 0:
+        logger.draw()
+        export(config, state)
+
+
+def export(config: TrainConfig, state: TrainState) -> None:
+    """Refreshes policy.npz."""
+    try:
+        from tlq.export import export_policy
+    except ImportError:
+        return
+    export_policy(Path(config.run) / "policy.npz", config=config, params=state.params.policy, normaliser=state.normaliser)
+
+
+def save_failed(config: TrainConfig, before: TrainState, iteration: int) -> str:
+    """Saves the whole state before a failed update, from which one `Learner.step` fails again; returns the message."""
+    place = Path(config.run) / "failed"
+    failed = Checkpoints(place)
+    failed.save(iteration - 1, before, {"seed": config.seed, "iteration": iteration})
+    failed.close()
+    leaves = zip(names(before.env_state), jax.tree.leaves(before.env_state), strict=True)
+    bad = [n for n, x in leaves if np.issubdtype(x.dtype, np.floating) and not np.isfinite(x).all()]
+    why = f"; not finite before it: {', '.join(bad[:4])}" if bad else ""
+    return f"update {iteration} (seed {config.seed}) isn't finite; the state before it is in {place}{why}"
+
+
+def initialise(state: TrainState, source: str) -> TrainState:
+    """Parameters and normaliser from another run's folder or from an exported policy (which has no critic)."""
+    path = Path(source)
+    if path.is_dir():
+        arrays = read_arrays(path / "checkpoints" if (path / "checkpoints").is_dir() else path)
+    elif path.is_file():
+        with np.load(path) as file:
+            arrays = {k: file[k] for k in file.files}
+    else:
+        raise ValueError(f"init={source}: no such run folder or policy file")
+    parts = {"params": state.params, "normaliser": state.normaliser}
+    taken = []
+
+    def take(name: str, x: jax.Array) -> jax.Array:
+        new = arrays.get(name)
+        if new is None or new.shape != x.shape:
+            if name.startswith("params.policy"):
+                has = "missing" if new is None else f"of shape {new.shape}"
+                raise ValueError(f"init={source} doesn't fit: {name} is {has}, not of shape {x.shape}")
+            return x
+        taken.append(name)
+        return jax.device_put(new.astype(x.dtype), x.sharding)
+
+    flat = [take(n, x) for n, x in zip(names(parts), jax.tree.leaves(parts), strict=True)]
+    parts = jax.tree.unflatten(jax.tree.structure(parts), flat)
+    print(f"init: {len(taken)} of {len(flat)} arrays from {source}", flush=True)
+    return state.replace(params=parts["params"], normaliser=parts["normaliser"])
+
+
+def open_folder(config: TrainConfig) -> Path:
+    """The run's folder; it must be new, or hold a run if `resume` is set."""
+    folder = Path(config.run)
+    if config.resume:
+        if not (folder / "config.yaml").exists():
+            raise ValueError(f"run={folder} holds no run to resume")
+    elif folder.exists() and any(folder.iterdir()):
+        raise ValueError(f"run={folder} exists already; add resume=true to go on with it, or choose another name")
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder
+
+
+@contextlib.contextmanager
+def _stop_on_signals() -> Iterator[list[int]]:
+    """A list that isn't empty once SIGINT or SIGTERM came; a second signal ends the process at once."""
+    stop: list[int] = []
+
+    def handle(number: int, frame: Any) -> None:
+        stop.append(number)
+        signal.signal(number, signal.SIG_DFL)
+        print("stopping after this iteration", flush=True)
+
+    before = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield stop
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _agree(flag: bool) -> bool:
+    """What the first host decides, on all hosts."""
+    if jax.process_count() == 1:
+        return flag
+    from jax.experimental import multihost_utils
+
+    return bool(multihost_utils.broadcast_one_to_all(np.asarray(flag)))
