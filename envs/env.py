@@ -3,6 +3,7 @@
 Letters: L = 4 legs (LF, RF, LR, RR), J = 12 joints, P = 25 sample points a foot.
 """
 
+import dataclasses
 import functools
 
 import jax
@@ -45,7 +46,7 @@ class QuadrupedEnv(Env):
         self._planes = physics.plane_ids(self.mj_model, config.num_planes)
         self._rings = np.array([radius for count, radius in tg.samples.RINGS for _ in range(count)])
 
-    # --- Brax's interface ---------------------------------------------------------------------------------------------
+    # -- Brax's interface
 
     @property
     def observation_size(self) -> dict[str, int]:
@@ -83,7 +84,7 @@ class QuadrupedEnv(Env):
         level = jax.random.randint(key_level, (), 0, min(top, self.levels))
         episode = self.begin(key, level)
         zero = jnp.zeros(())
-        metrics = {name: zero for name in self.metric_names} | {"level": self._share(level)}
+        metrics = dict.fromkeys(self.metric_names, zero) | {"level": self._share(level)}
         info = {"truncation": zero, "level": level}
         return State(episode, self.observe(episode), zero, zero, metrics, info)
 
@@ -97,12 +98,12 @@ class QuadrupedEnv(Env):
         state = self.advance(state, action)
         return state.replace(obs=self.observe(state.pipeline_state))
 
-    # --- the parts of a step, which `AutoReset` puts together in another way -----------------------------------------------
+    # -- the parts of a step, which `AutoReset` puts together in another way
 
     @property
     def metric_names(self) -> tuple[str, ...]:
         """Names in `state.metrics`."""
-        terms = ("along", "across", "smooth", "energy", "terrain", "height", "yaw", "tilt")
+        terms = ("along", "across", "smooth", "energy", "terrain", "height", "yaw", "heading", "tilt")
         ends = ("ended", "distance", "length", "fell", "level", "exploded")
         return (*(f"reward/{t}" for t in terms), *(f"episode/{e}" for e in ends), "speed", "lift", "level")
 
@@ -116,7 +117,9 @@ class QuadrupedEnv(Env):
         rows = max(self.bank.num_terrains // self.levels, 1)
         terrain = (jax.random.randint(next(keys), (), 0, rows) * self.levels + level) % self.bank.num_terrains
         xy = jax.random.uniform(next(keys), (2,), minval=-1.0, maxval=1.0) * c.spawn_offset
-        yaw, angle = jax.random.uniform(next(keys), (2,), minval=-1.0, maxval=1.0) * jnp.array([c.spawn_yaw, jnp.pi])
+        yaw, angle = jax.random.uniform(next(keys), (2,), minval=-1.0, maxval=1.0) * jnp.array(
+            [c.spawn_yaw, jnp.pi]
+        )
         # At ±π/2 every foot is in the middle of its step: fading in the stride pushes the robot neither way.
         phase = jnp.where(jax.random.bernoulli(next(keys)), 0.5, -0.5) * jnp.pi
         walk = jax.random.uniform(next(keys)) >= c.stand_share
@@ -139,6 +142,7 @@ class QuadrupedEnv(Env):
             floor=jnp.maximum(self.bank.floor[terrain], -depth),
             command=command,
             origin=xy,
+            heading=yaw,
             progress=jnp.zeros(()),
             lift_off=jnp.zeros(4) + ground,
             step=jnp.int32(0),
@@ -153,7 +157,7 @@ class QuadrupedEnv(Env):
         controller, desired = self.core.act(before.controller, action, sensors, command)
         after = self._simulate(before, desired)
         after = after.replace(controller=controller, step=before.step + 1)
-        feet, below, around = self._feet_and_terrain(after)
+        below, around = self._terrain_at_feet(after)
         after = after.replace(
             progress=jnp.maximum(before.progress, (after.qpos[:2] - after.origin) @ after.command),
             lift_off=jnp.where(tg.path.leg_phases(controller.phase) > 0, before.lift_off, around[:, 0]),
@@ -163,7 +167,7 @@ class QuadrupedEnv(Env):
 
         finite = jnp.all(jnp.isfinite(after.qpos)) & jnp.all(jnp.isfinite(after.qvel))
         exploded = ~finite | (jnp.max(jnp.abs(after.qvel)) > 200.0)
-        fell = self._fell(after, feet, below, around) | exploded
+        fell = self._fell(after, below, around) | exploded
         over = (after.step >= self.episode_steps) | (after.progress >= GOAL) | self._off_map(after)
         truncated = over & ~fell
         done = over | fell
@@ -177,7 +181,9 @@ class QuadrupedEnv(Env):
             "exploded": exploded,
         }
         metrics = {f"reward/{name}": jnp.where(exploded, 0.0, value) for name, value in weighted.items()}
-        metrics |= {f"episode/{name}": jnp.where(done, jnp.float32(value), 0.0) for name, value in ends.items()}
+        metrics |= {
+            f"episode/{name}": jnp.where(done, jnp.float32(value), 0.0) for name, value in ends.items()
+        }
         metrics |= {
             "speed": jnp.where(exploded, 0.0, after.qvel[:2] @ after.command),
             "lift": jnp.mean(controller.lift),
@@ -203,7 +209,7 @@ class QuadrupedEnv(Env):
         down = counts & (episode.progress < c.down * reachable)
         return jnp.clip(level + up.astype(jnp.int32) - down.astype(jnp.int32), 0, self.levels - 1)
 
-    # --- senses --------------------------------------------------------------------------------------------------------
+    # -- senses
 
     def heading_command(self, episode: Episode) -> jax.Array:
         """The command (2,) in the heading frame."""
@@ -212,14 +218,21 @@ class QuadrupedEnv(Env):
     def sense(self, episode: Episode) -> tg.Sensors:
         """What the robot measures, with noise; the same at every call on the same episode."""
         r = self.config.randomisation
-        clean = tg.Sensors(episode.qpos[3:7], episode.qvel[3:6], episode.qpos[7:], episode.qvel[6:])
+        clean = exact_sensors(episode)
         if not r.enabled:
             return clean
         noise = jax.random.normal(jax.random.fold_in(episode.key, 1), (30,))
         # Half angles about x and y turn the quaternion by the tilt error.
         roll, pitch = 0.5 * r.tilt_noise * noise[0], 0.5 * r.tilt_noise * noise[1]
         w, x, y, z = clean.orientation
-        turned = jnp.stack([w - x * roll - y * pitch, x + w * roll - z * pitch, y + w * pitch + z * roll, z + x * pitch - y * roll])
+        turned = jnp.stack(
+            [
+                w - x * roll - y * pitch,
+                x + w * roll - z * pitch,
+                y + w * pitch + z * roll,
+                z + x * pitch - y * roll,
+            ]
+        )
         return tg.Sensors(
             turned / jnp.linalg.norm(turned),
             clean.angular_velocity + r.angular_velocity_noise * noise[2:5],
@@ -230,31 +243,33 @@ class QuadrupedEnv(Env):
     def observe(self, episode: Episode) -> dict[str, jax.Array]:
         """The observations of policy and critic."""
         sensors, command = self.sense(episode), self.heading_command(episode)
-        yaw = tg.frames.yaw(episode.qpos[3:7])
         points = self.core.sample_points(self.core.feet(sensors))
-        offset = episode.randomised.map_offset
-        true = self._heights(episode, yaw, points)
-        heights = self._heights(episode, yaw, points + offset[:2]) + offset[2] if self.config.randomisation.enabled else true
-        if self.config.randomisation.enabled:
-            noise = jax.random.normal(jax.random.fold_in(episode.key, 2), heights.shape)
-            heights = heights + self.config.randomisation.height_noise * noise
-        state = self.core.observe(episode.controller, sensors, heights if self.core.heights else None, command)
+        true = seen = self._heights(episode, points)
+        if self.config.randomisation.enabled and self.core.heights:
+            offset = episode.randomised.map_offset
+            noise = jax.random.normal(jax.random.fold_in(episode.key, 2), seen.shape)
+            seen = self._heights(episode, points + offset[:2]) + offset[2]
+            seen = seen + self.config.randomisation.height_noise * noise
+        state = self.core.observe(episode.controller, sensors, seen if self.core.heights else None, command)
         return {"state": state, "privileged_state": self._privileged(episode, state, true, command)}
 
-    def _heights(self, episode: Episode, yaw: jax.Array, points: jax.Array) -> jax.Array:
+    def _heights(self, episode: Episode, points: jax.Array) -> jax.Array:
         """Terrain heights (...) m from the trunk's centre, at points (..., 2) m of the heading frame."""
-        world = episode.qpos[:2] + tg.frames.turn(yaw, points)
+        world = episode.qpos[:2] + tg.frames.turn(tg.frames.yaw(episode.qpos[3:7]), points)
         return terrains.height(self.bank, episode.terrain, world) - episode.qpos[2]
 
-    def _privileged(self, episode: Episode, state: jax.Array, true: jax.Array, command: jax.Array) -> jax.Array:
+    def _privileged(
+        self, episode: Episode, state: jax.Array, true: jax.Array, command: jax.Array
+    ) -> jax.Array:
         """The critic's observation: the policy's, 100 heights where it has none, and 24 values it can't know."""
         r, mirror = episode.randomised, self.core.update_mirror(episode.controller.mirror, command)
-        velocity = tg.frames.turn(-tg.frames.yaw(episode.qpos[3:7]), episode.qvel[:2]) * jnp.stack([1.0 + 0 * mirror, mirror])
-        below = self.core.feet(tg.Sensors(episode.qpos[3:7], episode.qvel[3:6], episode.qpos[7:], episode.qvel[6:]))[:, 2] - true[:, 0]
+        side = jnp.stack([jnp.ones_like(mirror), mirror])
+        velocity = tg.frames.turn(-tg.frames.yaw(episode.qpos[3:7]), episode.qvel[:2])
+        below = self.core.feet(exact_sensors(episode))[:, 2] - true[:, 0]
         order = jnp.where(mirror > 0, jnp.arange(4), jnp.array([1, 0, 3, 2]))
         rest = jnp.concatenate(
             [
-                velocity,
+                velocity * side,
                 episode.qvel[2:3],
                 10.0 * jnp.clip(below[order] - self.robot.foot_radius, -0.1, 0.1),
                 episode.controller.lift[order] * 10.0,
@@ -273,7 +288,7 @@ class QuadrupedEnv(Env):
                         episode.controller.gate,
                     ]
                 ),
-                episode.controller.stride * jnp.stack([1.0 + 0 * mirror, mirror]),
+                episode.controller.stride * side,
             ]
         )
         parts = [state, rest]
@@ -281,7 +296,7 @@ class QuadrupedEnv(Env):
             parts.append(5.0 * jnp.clip(below[:, None] + true[:, :1] - true, -0.25, 0.25).reshape(-1))
         return jnp.concatenate(parts)
 
-    # --- physics --------------------------------------------------------------------------------------------------------
+    # -- physics
 
     def _simulate(self, episode: Episode, desired: jax.Array) -> Episode:
         """Physics over one control period, joints under PD control."""
@@ -309,7 +324,12 @@ class QuadrupedEnv(Env):
             torque = jnp.clip(kp * (followed - qpos[7:]) - kd * qvel[6:], -limit, limit)
             now = data.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart)
             now = physics.substep(
-                model, now, self._planes, self.robot.foot_geom_ids, contact, jnp.concatenate([jnp.zeros(6), torque])
+                model,
+                now,
+                self._planes,
+                self.robot.foot_geom_ids,
+                contact,
+                jnp.concatenate([jnp.zeros(6), torque]),
             )
             return (now.qpos, now.qvel, now.qacc_warmstart, torque), None
 
@@ -343,16 +363,17 @@ class QuadrupedEnv(Env):
             map_offset=drift * (2.0 * u[5:8] - 1.0),
         )
 
-    # --- judgement -------------------------------------------------------------------------------------------------------
+    # -- judgement
 
-    def _feet_and_terrain(self, episode: Episode) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """Feet (L, 3) m in the heading frame at the trunk; z_ij (L, P) m; terrain heights (L, P) m in the world."""
-        sensors = tg.Sensors(episode.qpos[3:7], episode.qvel[3:6], episode.qpos[7:], episode.qvel[6:])
-        feet = self.core.feet(sensors)
-        heights = self._heights(episode, tg.frames.yaw(episode.qpos[3:7]), self.core.sample_points(feet))
-        return feet, feet[:, 2:] - heights, heights + episode.qpos[2]
+    def _terrain_at_feet(self, episode: Episode) -> tuple[jax.Array, jax.Array]:
+        """z_ij (L, P) m, foot height minus terrain height; terrain heights (L, P) m in the world."""
+        feet = self.core.feet(exact_sensors(episode))
+        heights = self._heights(episode, self.core.sample_points(feet))
+        return feet[:, 2:] - heights, heights + episode.qpos[2]
 
-    def _reward_terms(self, before: Episode, after: Episode, below: jax.Array, around: jax.Array) -> dict[str, jax.Array]:
+    def _reward_terms(
+        self, before: Episode, after: Episode, below: jax.Array, around: jax.Array
+    ) -> dict[str, jax.Array]:
         c = self.config.rewards
         velocity, command = after.qvel[:2], after.command
         walking = jnp.sum(jnp.square(command)) > 0.5
@@ -366,13 +387,18 @@ class QuadrupedEnv(Env):
             "across": rewards.across(velocity, command),
             "smooth": rewards.smooth(after.controller.desired, before.controller.desired),
             "energy": rewards.energy(after.torque, after.qvel[6:], literal=c.literal),
-            "terrain": jnp.mean(rewards.terrain(~swing, below[:, near], c.gap_threshold, graded=c.terrain_graded)),
-            "height": jnp.mean(jnp.where(swing, rewards.height(after.controller.lift, rise, c.lift_threshold), 0.0)),
+            "terrain": jnp.mean(
+                rewards.terrain(~swing, below[:, near], c.gap_threshold, graded=c.terrain_graded)
+            ),
+            "height": jnp.mean(
+                jnp.where(swing, rewards.height(after.controller.lift, rise, c.lift_threshold), 0.0)
+            ),
             "yaw": -jnp.square(after.qvel[5]),
+            "heading": jnp.cos(tg.frames.yaw(after.qpos[3:7]) - after.heading) - 1.0,
             "tilt": -0.1 * jnp.sum(jnp.square(after.qvel[3:5])),
         }
 
-    def _fell(self, episode: Episode, feet: jax.Array, below: jax.Array, around: jax.Array) -> jax.Array:
+    def _fell(self, episode: Episode, below: jax.Array, around: jax.Array) -> jax.Array:
         """Whether trunk or a knee hits the terrain, the trunk tilts too far, or a foot is in a gap."""
         c = self.config
         rotation = tg.frames.rotation(episode.qpos[3:7])
@@ -402,15 +428,24 @@ class QuadrupedEnv(Env):
         return level / max(self.levels - 1, 1)
 
 
+def exact_sensors(episode: Episode) -> tg.Sensors:
+    """What the robot would measure without noise."""
+    return tg.Sensors(episode.qpos[3:7], episode.qvel[3:6], episode.qpos[7:], episode.qvel[6:])
+
+
 def check(config: EnvConfig) -> None:
     """Raises ValueError on a configuration that makes no sense."""
     if config.method not in METHODS:
         raise ValueError(f"unknown method '{config.method}'; choose one of {', '.join(METHODS)}")
     ratio = config.control_dt / config.physics_dt
     if abs(ratio - round(ratio)) > 1e-6 or ratio < 1:
-        raise ValueError(f"control_dt={config.control_dt} must be a whole multiple of physics_dt={config.physics_dt}")
+        raise ValueError(
+            f"control_dt={config.control_dt} must be a whole multiple of physics_dt={config.physics_dt}"
+        )
     if len(config.curriculum.difficulty) != len(config.curriculum.depth) or not config.curriculum.depth:
-        raise ValueError("curriculum.difficulty and curriculum.depth must have the same number of levels, at least 1")
+        raise ValueError(
+            "curriculum.difficulty and curriculum.depth must have the same number of levels, at least 1"
+        )
 
 
 def make_bank(config: EnvConfig) -> terrains.Bank:
@@ -424,13 +459,10 @@ def make_core(config: EnvConfig, robot: Robot) -> tg.Core:
     settings = config.tg
     if config.method == "fixed_height":
         # Lee et al. 2020: the TG moves the feet up and down by a fixed height, the residuals do the rest.
-        import dataclasses
-
         settings = dataclasses.replace(settings, step_length=0.0, lift_range=0.0)
     f32 = functools.partial(np.asarray, dtype=np.float32)
-    # Canonical axes are +x, -y, -y.
-    sign = robot.axis_sign[0] * np.array([1.0, -1.0, -1.0])
-    geometry = tg.LegGeometry(*map(f32, (robot.hip_position, robot.hip_offset, robot.thigh, robot.shank, sign)))
+    shape = (robot.hip_position, robot.hip_offset, robot.thigh, robot.shank, robot.joint_sign[0])
+    geometry = tg.LegGeometry(*map(f32, shape))
     return tg.Core(
         settings,
         geometry,

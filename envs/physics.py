@@ -1,13 +1,13 @@
 """One physics substep in MJX, with the feet on the terrain bank's true primitives.
 
-MJX has no cheap collision of spheres with thousands of boxes and cylinders. Here each foot has planes of its own, paired
-with it in the model, and every substep lays them against the surfaces nearest to the foot: plane-sphere contact is then
-exactly sphere-box and sphere-cylinder contact. MJX's own functions run in the order of `mjx.step`; the planes are placed
-between kinematics and collision, so nothing is computed twice.
+MJX has no cheap collision of spheres with thousands of boxes and cylinders. Here each foot has planes of its own,
+paired with it in the model, and every substep lays them against the surfaces nearest to the foot: plane-sphere contact
+is then exactly sphere-box and sphere-cylinder contact. MJX's own functions run in the order of `mjx.step`; the planes
+are placed between kinematics and collision, so nothing is computed twice.
 """
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +21,7 @@ from envs.robots.quadruped import LEGS
 FEET = tuple(f"{leg}_foot" for leg in LEGS)
 
 Contact = Callable[[jax.Array], tuple[jax.Array, jax.Array, jax.Array]]
-"""Foot centres (L, 3) m to distance (L, N) m, normal (L, N, 3) and surface point (L, N, 3) m of the N nearest surfaces."""
+"""Foot centres (L, 3) m to the N nearest surfaces: distance (L, N) m, normal (L, N, 3), surface point (L, N, 3) m."""
 
 
 def physics_model(config: RobotConfig, timestep: float, num_planes: int) -> tuple[mujoco.MjModel, Robot]:
@@ -35,26 +35,36 @@ def physics_model(config: RobotConfig, timestep: float, num_planes: int) -> tupl
         spec.delete(actuator)
     spec.option.timestep = timestep
     for foot in FEET:
-        for plane in range(num_planes):
-            name = f"{foot}_plane{plane}"
-            spec.worldbody.add_geom(
-                name=name, type=mujoco.mjtGeom.mjGEOM_PLANE, size=(1, 1, 0.1), contype=0, conaffinity=0, rgba=(0, 0, 0, 0)
-            )
-            spec.add_pair(
-                geomname1=name, geomname2=foot, condim=3, friction=[config.foot_friction] * 2 + [0.005, 1e-4, 1e-4]
-            )
+        add_planes(spec, foot, num_planes, config.foot_friction)
     model = spec.compile()
     # The world's geoms come before the robot's, so the feet have other ids now.
     return model, dataclasses.replace(robot, foot_geom_ids=np.array([model.geom(foot).id for foot in FEET]))
 
 
-def plane_ids(model: mujoco.MjModel, num_planes: int) -> np.ndarray:
+def add_planes(spec: mujoco.MjSpec, foot: str, num_planes: int, friction: float) -> None:
+    """Adds terrain planes to a model, each paired with a foot's geom and touching nothing else."""
+    for plane in range(num_planes):
+        name = f"{foot}_plane{plane}"
+        spec.worldbody.add_geom(
+            name=name,
+            type=mujoco.mjtGeom.mjGEOM_PLANE,
+            # Where the planes aren't placed, as in `settle`, there is one ground, not two.
+            pos=(0, 0, -plane),
+            size=(1, 1, 0.1),
+            contype=0,
+            conaffinity=0,
+            rgba=(0, 0, 0, 0),
+        )
+        spec.add_pair(geomname1=name, geomname2=foot, condim=3, friction=[friction] * 2 + [0.005, 1e-4, 1e-4])
+
+
+def plane_ids(model: mujoco.MjModel, num_planes: int, feet: Sequence[str] = FEET) -> np.ndarray:
     """(L, num_planes) geom ids of the terrain planes."""
-    return np.array([[model.geom(f"{foot}_plane{i}").id for i in range(num_planes)] for foot in FEET])
+    return np.array([[model.geom(f"{foot}_plane{i}").id for i in range(num_planes)] for foot in feet])
 
 
 def frame(normal: jax.Array) -> jax.Array:
-    """A rotation (..., 3, 3) whose last column is the unit normal (..., 3); upward normals have no preferred heading."""
+    """A rotation (..., 3, 3) whose last column is the unit normal (..., 3)."""
     x, y, z = normal[..., 0], normal[..., 1], normal[..., 2]
     # Turn that takes e_z to the normal the short way; normals never point straight down.
     k = 1.0 / (1.0 + jnp.maximum(z, -0.99))
@@ -74,7 +84,7 @@ def substep(
       planes: (L, N) geom ids.
       feet: (L,) geom ids.
       contact: surfaces near the feet.
-      qfrc: (18,) generalised force.
+      qfrc: (nv,) generalised force.
     """
     data = mjx.kinematics(model, data)
     _, normal, point = contact(data.geom_xpos[feet])

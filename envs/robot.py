@@ -165,7 +165,8 @@ def robot_spec(config: RobotConfig, *, look: bool = False) -> mujoco.MjSpec:
 
 def make_robot(config: RobotConfig = RobotConfig()) -> Robot:
     """The record of a robot that stands alone; its ids hold in any model that adds bodies after the
-    robot's."""
+    robot's.
+    """
     return read_robot(robot_spec(config).compile(), config)
 
 
@@ -221,7 +222,8 @@ def _feet() -> tuple[str, ...]:
 
 def _set_training_physics(spec: mujoco.MjSpec) -> None:
     """One iteration of Newton settles the same stand as a hundred; joints have no damping to integrate
-    implicitly."""
+    implicitly.
+    """
     option = spec.option
     option.timestep = 0.005
     option.integrator = mujoco.mjtIntegrator.mjINT_EULER

@@ -124,7 +124,8 @@ def _split(piece: Rectangle, largest: float) -> list[Rectangle]:
 
 def _draw_ground(spec: mujoco.MjSpec, pieces: np.ndarray, floor: float) -> None:
     """Tops coloured by height, small ones in shades of their own; the plane below chequered, dark where it is
-    a pit."""
+    a pit.
+    """
     pit = floor < -0.05
     dark, bright = ((0.30, 0.34, 0.40), (0.34, 0.38, 0.44)) if pit else (_shade(0.0, -0.9), _shade(0.0, 0.3))
     spec.add_texture(

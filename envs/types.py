@@ -48,6 +48,8 @@ class Episode:
     """(2,) unit vector in the world, or 0 to stand."""
     origin: jax.Array
     """(2,) m, where the robot started."""
+    heading: jax.Array
+    """() rad, yaw at the start."""
     progress: jax.Array
     """() m, largest progress along the command so far."""
     lift_off: jax.Array

@@ -25,6 +25,9 @@ class RewardConfig:
     """Weight of r_height (1/m, mean over the feet)."""
     yaw: float = 0.1
     """Weight of the squared yaw rate (s²/rad²). The paper commands a yaw rate of 0 but has no term for it."""
+    heading: float = 0.3
+    """Weight of 1 - cos(drift of the heading since the start). The paper commands no turning; a penalty on the yaw rate
+    alone leaves a slow drift, which adds up to radians over 5 m."""
     tilt: float = 0.2
     """Weight of the squared roll and pitch rates (s²/rad²), scaled by 0.1; not in the paper."""
     literal: bool = False

@@ -25,7 +25,7 @@ class TGConfig:
     """Lower bound of H + δh (m)."""
     lift_max: float = 0.14
     """Upper bound of H + δh (m): higher than this the knee limit is reached."""
-    residual_range: float = 0.25
+    residual_range: float = 0.3
     """Residual joint angle at action ±1 (rad); small enough that residuals cannot cancel a whole step."""
     levelling: float = 1.0
     """Share of the trunk's roll and pitch that is taken out of the feet's base positions. 1 is the paper's horizontal

@@ -10,6 +10,7 @@ import functools
 from typing import Any, NamedTuple
 
 from tg import frames, leg, path, samples
+from tg.arrays import stack
 from tg.config import TGConfig
 
 Array = Any
@@ -110,7 +111,9 @@ class Core:
     def standing_target(self) -> Array:
         """Desired joint angles (12,) rad of the standing robot: the default pose, and what the weight asks for."""
         pose = self.default_pose.reshape(4, 3)
-        load = self.config.weight_compensation * self.sag * 0.25 * abs(self.geometry.thigh / self.geometry.thigh)
+        load = (
+            self.config.weight_compensation * self.sag * 0.25 * abs(self.geometry.thigh / self.geometry.thigh)
+        )
         return (pose + leg.support_torque(self.geometry, pose, load)).reshape(-1)
 
     def initial_state(self, phase: Array) -> ControllerState:
@@ -143,10 +146,11 @@ class Core:
         Args:
           feet: (4, 3) m, of `feet`.
         """
-        xp = feet.__array_namespace__()
-        return feet[:, None, :2] + xp.asarray(samples.ring_offsets(), dtype=feet.dtype)
+        return feet[:, None, :2] + self._ring_offsets
 
-    def observe(self, state: ControllerState, sensors: Sensors, heights: Array | None, command: Array) -> Array:
+    def observe(
+        self, state: ControllerState, sensors: Sensors, heights: Array | None, command: Array
+    ) -> Array:
         """The policy's observation.
 
         Args:
@@ -166,7 +170,7 @@ class Core:
             sensors.joint_position - self.default_pose,
             0.1 * sensors.joint_velocity,
             xp.reshape(state.frequency - self.config.base_frequency, (1,)),
-            xp.stack([xp.sin(state.phase), xp.cos(state.phase)]),
+            stack([xp.sin(state.phase), xp.cos(state.phase)]),
             xp.reshape(state.actions, (-1,)),
             xp.reshape(10.0 * (xp.reshape(state.targets, (TARGET_HISTORY, 4, 3)) - self.base_foot), (-1,)),
         ]
@@ -177,7 +181,7 @@ class Core:
         observation = xp.concatenate(parts)
         mirror = self.update_mirror(state.mirror, command)
         index, sign = self._observation_mirror
-        return xp.where(mirror > 0, observation, observation[xp.asarray(index)] * xp.asarray(sign, dtype=mirror.dtype))
+        return xp.where(mirror > 0, observation, observation[index] * sign)
 
     def act(
         self, state: ControllerState, action: Array, sensors: Sensors, command: Array
@@ -199,7 +203,9 @@ class Core:
         frequency = c.base_frequency + c.frequency_range * action[0]
         moving = xp.where(xp.sum(command * command) > 0.25, 1.0 + 0.0 * frequency, 0.0 * frequency)
 
-        phase = path.wrap(state.phase + moving * (path.advance(state.phase, frequency, self.dt) - state.phase))
+        phase = path.wrap(
+            state.phase + moving * (path.advance(state.phase, frequency, self.dt) - state.phase)
+        )
         step = self.dt / c.start_time
         gate = state.gate + xp.clip(moving - state.gate, -step, step)
         stride = state.stride + xp.clip(command - state.stride, -step, step)
@@ -211,7 +217,9 @@ class Core:
         residual = c.residual_range * xp.reshape(action[2:], (4, 3))
         wanted = tg_angles + residual
         reached = leg.forward(self.geometry, wanted)
-        sag = leg.support_torque(self.geometry, wanted, c.weight_compensation * self.sag * load_share(phases, gate))
+        sag = leg.support_torque(
+            self.geometry, wanted, c.weight_compensation * self.sag * load_share(phases, gate)
+        )
         desired = xp.clip(xp.reshape(wanted + sag, (12,)), self.lower, self.upper)
         state = ControllerState(
             phase=phase,
@@ -220,8 +228,8 @@ class Core:
             stride=stride,
             gate=gate,
             mirror=mirror,
-            actions=xp.stack([action, *state.actions[: ACTION_HISTORY - 1]]),
-            targets=xp.stack([xp.reshape(reached, (12,)), *state.targets[: TARGET_HISTORY - 1]]),
+            actions=stack([action, *state.actions[: ACTION_HISTORY - 1]], axis=-2),
+            targets=stack([xp.reshape(reached, (12,)), *state.targets[: TARGET_HISTORY - 1]], axis=-2),
             desired=desired,
         )
         return state, desired
@@ -255,15 +263,26 @@ class Core:
     def mirror_action(self, mirror: Array, action: Array) -> Array:
         """An action (14,) turned into its mirror image where mirror () is -1."""
         xp = action.__array_namespace__()
-        index, sign = _mirror_map([("scalar", 2), ("joints", 12)])
-        return xp.where(mirror > 0, action, action[xp.asarray(index)] * xp.asarray(sign, dtype=action.dtype))
+        index, sign = self._action_mirror
+        return xp.where(mirror > 0, action, action[index] * sign)
 
     def _lift(self, action: Array) -> Array:
         xp, c = action.__array_namespace__(), self.config
         return xp.clip(c.lift + c.lift_range * action, c.lift_min, c.lift_max)
 
+    # Constants are arrays of the same library as the robot's (NumPy), made once: lists would cost a step 30 µs.
+
     @functools.cached_property
-    def _observation_mirror(self) -> tuple[list[int], list[float]]:
+    def _ring_offsets(self) -> Array:
+        return self._constant(samples.ring_offsets())
+
+    @functools.cached_property
+    def _action_mirror(self) -> tuple[Array, Array]:
+        index, sign = _mirror_map([("scalar", 2), ("joints", 12)])
+        return self.base_foot.__array_namespace__().asarray(index), self._constant(sign)
+
+    @functools.cached_property
+    def _observation_mirror(self) -> tuple[Array, Array]:
         kinds: list[tuple[str, int]] = []
         for name, size in self.layout:
             if name == "actions":
@@ -272,7 +291,11 @@ class Core:
                 kinds += [("feet", 12)] * TARGET_HISTORY
             else:
                 kinds.append((_KIND[name], size))
-        return _mirror_map(kinds)
+        index, sign = _mirror_map(kinds)
+        return self.base_foot.__array_namespace__().asarray(index), self._constant(sign)
+
+    def _constant(self, values: list[Any]) -> Array:
+        return self.base_foot.__array_namespace__().asarray(values, dtype=self.base_foot.dtype)
 
 
 def load_share(phases: Array, gate: Array) -> Array:

@@ -2,26 +2,26 @@
 
 from typing import Any
 
+from tg.arrays import stack
+
 Array = Any
 
 
 def rotation(quaternion: Array) -> Array:
     """Rotation matrix (..., 3, 3), world from trunk, of a unit quaternion (..., 4) in the order w, x, y, z."""
-    xp = quaternion.__array_namespace__()
     w, x, y, z = (quaternion[..., i] for i in range(4))
     rows = (
         (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
         (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
         (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
     )
-    return xp.stack([xp.stack(row, axis=-1) for row in rows], axis=-2)
+    return stack([stack(row) for row in rows], axis=-2)
 
 
 def up_in_trunk(quaternion: Array) -> Array:
     """The world's up direction (..., 3) in the trunk's frame: roll and pitch, but no yaw."""
-    xp = quaternion.__array_namespace__()
     w, x, y, z = (quaternion[..., i] for i in range(4))
-    return xp.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], axis=-1)
+    return stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)])
 
 
 def yaw(quaternion: Array) -> Array:
@@ -43,14 +43,9 @@ def heading_from_trunk(up: Array) -> Array:
     cos_roll, sin_roll = up[..., 2] / cos_pitch, up[..., 1] / cos_pitch
     sin_pitch = -up[..., 0]
     zero = 0.0 * cos_pitch
-    return xp.stack(
-        [
-            xp.stack([cos_pitch, sin_pitch * sin_roll, sin_pitch * cos_roll], axis=-1),
-            xp.stack([zero, cos_roll, -sin_roll], axis=-1),
-            up,
-        ],
-        axis=-2,
-    )
+    forward = stack([cos_pitch, sin_pitch * sin_roll, sin_pitch * cos_roll])
+    left = stack([zero, cos_roll, -sin_roll])
+    return stack([forward, left, up], axis=-2)
 
 
 def turn(angle: Array, vector: Array) -> Array:
@@ -58,4 +53,4 @@ def turn(angle: Array, vector: Array) -> Array:
     xp = vector.__array_namespace__()
     cos, sin = xp.cos(angle), xp.sin(angle)
     x, y = vector[..., 0], vector[..., 1]
-    return xp.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
+    return stack([cos * x - sin * y, sin * x + cos * y])

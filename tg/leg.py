@@ -5,6 +5,8 @@ The canonical joint axes are those of Max: +x, -y, -y. Other axes are handled by
 
 from typing import Any, NamedTuple
 
+from tg.arrays import stack
+
 Array = Any
 
 
@@ -39,7 +41,7 @@ def forward(leg: LegGeometry, q: Array) -> Array:
     x = leg.thigh * xp.sin(hip) + leg.shank * xp.sin(hip + knee)
     down = leg.thigh * xp.cos(hip) + leg.shank * xp.cos(hip + knee)
     cos, sin = xp.cos(abduction), xp.sin(abduction)
-    return xp.stack([x, leg.offset * cos + down * sin, leg.offset * sin - down * cos], axis=-1)
+    return stack([x, leg.offset * cos + down * sin, leg.offset * sin - down * cos])
 
 
 def inverse(leg: LegGeometry, foot: Array) -> Array:
@@ -62,7 +64,7 @@ def inverse(leg: LegGeometry, foot: Array) -> Array:
     cosine = (x * x + down * down - leg.thigh**2 - leg.shank**2) / (2.0 * leg.thigh * leg.shank)
     knee = xp.arccos(xp.clip(cosine, -1.0, 1.0))
     hip = xp.arctan2(x, down) - xp.arctan2(leg.shank * xp.sin(knee), leg.thigh + leg.shank * xp.cos(knee))
-    return xp.stack([abduction, hip, knee], axis=-1) * leg.sign
+    return stack([abduction, hip, knee]) * leg.sign
 
 
 def support_torque(leg: LegGeometry, q: Array, load: Array) -> Array:
@@ -81,7 +83,7 @@ def support_torque(leg: LegGeometry, q: Array, load: Array) -> Array:
     canonical = q * leg.sign
     # ∂z/∂abduction = y, ∂z/∂hip = x cos(abduction), ∂z/∂knee = shank sin(hip + knee) cos(abduction).
     cos = xp.cos(canonical[..., 0])
-    slope = xp.stack(
-        [foot[..., 1], foot[..., 0] * cos, leg.shank * xp.sin(canonical[..., 1] + canonical[..., 2]) * cos], axis=-1
+    slope = stack(
+        [foot[..., 1], foot[..., 0] * cos, leg.shank * xp.sin(canonical[..., 1] + canonical[..., 2]) * cos]
     )
     return -load[..., None] * slope * leg.sign

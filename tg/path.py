@@ -3,6 +3,8 @@
 import math
 from typing import Any
 
+from tg.arrays import stack
+
 Array = Any
 
 TROT = (0.0, math.pi, math.pi, 0.0)
@@ -35,8 +37,7 @@ def advance(phase: Array, frequency: Array, dt: float) -> Array:
 
 def leg_phases(phase: Array) -> Array:
     """Phases (..., 4) rad of the legs from LF's phase (...) rad; swing is p > 0, stance is p ≤ 0."""
-    xp = phase.__array_namespace__()
-    return wrap(xp.stack([phase + offset for offset in TROT], axis=-1))
+    return wrap(stack([phase + offset for offset in TROT]))
 
 
 def stride(phase: Array) -> Array:
