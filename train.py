@@ -2,30 +2,35 @@
 
 import sys
 
-import hydra
-from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig
+from tlq.cores import use_all_cores
 
-from tlq import config as settings
+use_all_cores()  # before JAX starts
+
+import hydra  # noqa: E402
+from hydra.core.hydra_config import HydraConfig  # noqa: E402
+from omegaconf import DictConfig  # noqa: E402
+
+from tlq import cli  # noqa: E402
+from tlq import config as settings  # noqa: E402
 
 
 @hydra.main(version_base=None, config_path="tlq/conf", config_name="train")
 def run(node: DictConfig) -> None:
+    """One run, of the configuration that Hydra composed."""
     from tlq.training import TrainingFailed, train
 
     try:
         config = settings.from_hydra(node, HydraConfig.get().overrides.task)
         settings.use_cache(config.cache)
-        print(f"run {config.run}", flush=True)
         train(config)
     except (ValueError, TrainingFailed) as error:
-        settings.fail(error)
+        cli.fail(error)
 
 
 if __name__ == "__main__":
     settings.register()
     try:
-        settings.check(sys.argv[1:])
-    except settings.ConfigError as error:
-        settings.fail(error)
+        sys.argv[1:] = settings.clean(sys.argv[1:])
+    except cli.UsageError as error:
+        cli.fail(error)
     run()

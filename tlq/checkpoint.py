@@ -5,6 +5,7 @@ finds what went wrong on disk later.
 """
 
 import hashlib
+import json
 import logging
 from pathlib import Path
 from typing import Any
@@ -28,6 +29,7 @@ class Checkpoints:
         """Saves `state` (a pytree of arrays) and `extra` (JSON) under the number `step`."""
         leaves = _leaves(state)
         about = dict(extra, layout=_layout(leaves), digest=_digest(leaves))
+        about["checksum"] = _checksum(about)
         args = ocp.args.Composite(state=ocp.args.StandardSave(leaves), about=ocp.args.JsonSave(about))
         self._manager.save(step, args=args, force=True)
         self._manager.wait_until_finished()
@@ -49,23 +51,33 @@ class Checkpoints:
             leaves = None if about is None else self._read(step, jax.tree.map(_abstract, target))
             if leaves is not None and _digest(leaves) in ("", about["digest"]):
                 return _unflatten(like, leaves), about
-            print(f"checkpoint {self.folder / str(step)} is damaged; skipped", flush=True)
-            self._manager.delete(step)
+            aside = self.folder / f"damaged-{step}"
+            print(
+                f"checkpoint {self.folder / str(step)} is damaged; skipped, and renamed to {aside.name}",
+                flush=True,
+            )
+            (self.folder / str(step)).rename(aside)
+            self._manager.reload()
         raise ValueError(f"no readable checkpoint in {self.folder}")
 
     def _about(self, step: int) -> dict[str, Any] | None:
         try:
-            return self._manager.restore(step, args=ocp.args.Composite(about=ocp.args.JsonRestore()))["about"]
+            about = self._manager.restore(step, args=ocp.args.Composite(about=ocp.args.JsonRestore()))["about"]
+            checksum = about.pop("checksum", "")
+            return about if checksum in ("", _checksum(about)) else None
         except Exception:  # whatever a damaged file leads a reader to raise
             return None
 
     def _read(self, step: int, target: dict[str, Any]) -> dict[str, Any] | None:
         try:
-            return self._manager.restore(step, args=ocp.args.Composite(state=ocp.args.StandardRestore(target)))["state"]
+            return self._manager.restore(
+                step, args=ocp.args.Composite(state=ocp.args.StandardRestore(target))
+            )["state"]
         except Exception:
             return None
 
     def close(self) -> None:
+        """Frees what Orbax holds."""
         self._manager.close()
 
 
@@ -91,7 +103,10 @@ def _plain(x: Any) -> Any:
 
 def names(tree: Any) -> list[str]:
     """Name of each leaf of a pytree, e.g. 'params.policy.params.proprio.kernel'."""
-    return [jax.tree_util.keystr(p, simple=True, separator=".") for p, _ in jax.tree_util.tree_leaves_with_path(tree)]
+    return [
+        jax.tree_util.keystr(p, simple=True, separator=".")
+        for p, _ in jax.tree_util.tree_leaves_with_path(tree)
+    ]
 
 
 def _leaves(tree: Any) -> dict[str, Any]:
@@ -128,6 +143,10 @@ def _digest(leaves: dict[str, Any]) -> str:
         digest.update(name.encode())
         digest.update(np.ascontiguousarray(x).tobytes())
     return digest.hexdigest()
+
+
+def _checksum(about: dict[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()
 
 
 def _difference(path: Path, saved: list[list[Any]], wanted: list[list[Any]]) -> str:

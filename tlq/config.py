@@ -4,9 +4,7 @@ Each room's defaults stand in its own dataclass; Hydra's groups `terrain` and `m
 """
 
 import dataclasses
-import difflib
 import os
-import sys
 import time
 import types
 import typing
@@ -14,6 +12,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from tlq.cli import UsageError, unknown
 from tlq.networks import NetworkConfig
 from tlq.ppo import PPOConfig
 
@@ -54,10 +53,6 @@ class TrainConfig:
     """Folder of JAX's compilation cache; empty: none."""
 
 
-class ConfigError(ValueError):
-    """A setting that doesn't exist or isn't valid; the text names the valid ones."""
-
-
 def default_config() -> TrainConfig:
     """All defaults, the environment's included."""
     import envs
@@ -65,14 +60,20 @@ def default_config() -> TrainConfig:
     return TrainConfig(env=envs.EnvConfig())
 
 
-def make(name: str = "poles", *, num_terrains: int | None = None, method: str = "ours", **overrides: Any) -> Any:
+def make(
+    name: str = "poles", *, num_terrains: int | None = None, method: str = "ours", **overrides: Any
+) -> Any:
     """The quadruped on a kind of terrain, as a Brax environment (one instance, no auto-reset).
 
     overrides: other fields of `envs.EnvConfig` by name; nested ones with __ for the dot, e.g. tg__step_length=0.25.
     """
     import envs
 
-    values = {"terrain.kind": name, "method": method, **{k.replace("__", "."): v for k, v in overrides.items()}}
+    values = {
+        "terrain.kind": name,
+        "method": method,
+        **{k.replace("__", "."): v for k, v in overrides.items()},
+    }
     if num_terrains is not None:
         values["terrain.num_terrains"] = num_terrains
     config = envs.EnvConfig()
@@ -86,8 +87,10 @@ def replace(config: Any, key: str, value: Any) -> Any:
     name, _, rest = key.partition(".")
     known = [f.name for f in dataclasses.fields(config)]
     if name not in known:
-        raise ConfigError(_unknown("setting", name, known))
-    return dataclasses.replace(config, **{name: replace(getattr(config, name), rest, value) if rest else value})
+        raise UsageError(unknown("setting", name, known))
+    return dataclasses.replace(
+        config, **{name: replace(getattr(config, name), rest, value) if rest else value}
+    )
 
 
 # -- Hydra -----------------------------------------------------------------------------------------------------------
@@ -95,9 +98,10 @@ def replace(config: Any, key: str, value: Any) -> Any:
 
 def register() -> None:
     """Makes the schema and the choices of the groups known to Hydra."""
-    import terrains
     from hydra.core.config_store import ConfigStore
     from omegaconf import OmegaConf
+
+    import terrains
 
     store = ConfigStore.instance()
     schema = OmegaConf.structured(default_config())
@@ -121,35 +125,80 @@ def _writable(node: Any) -> None:
                 _writable(child)
 
 
-def check(arguments: Sequence[str]) -> None:
-    """Raises ConfigError, one line that names the valid choices, where Hydra would answer with pages."""
+def clean(arguments: Sequence[str]) -> list[str]:
+    """The command line with whole numbers written as such.
+
+    Raises UsageError, one line that names the valid choices, where Hydra would answer with many.
+    """
+    cleaned, flags, after = [], [], ""
+    for argument in arguments:
+        if argument.startswith("-") or after in ("-c", "--cfg", "-p", "--package"):
+            flags.append(argument)
+            cleaned.append(argument)
+        else:
+            cleaned.append(_clean(argument))
+        after = argument
+    if not flags:
+        _try(cleaned)
+    return cleaned
+
+
+def _clean(argument: str) -> str:
     import terrains
 
-    choices = {"terrain": terrains.kinds(), "method": METHODS}
-    schema = default_config()
-    for argument in arguments:
-        key, equals, value = argument.partition("=")
-        if argument.startswith("-") or key.startswith(("hydra", "+", "~")):
-            continue
-        if not equals:
-            raise ConfigError(f"'{argument}' isn't of the form key=value, e.g. terrain=poles")
-        if key in choices:
-            for name in value.split(","):
-                if name not in choices[key]:
-                    raise ConfigError(_unknown(key, name, choices[key]))
-            continue
-        node: Any = schema
-        for i, name in enumerate(key.split(".")):
-            known = [f.name for f in dataclasses.fields(node)] if dataclasses.is_dataclass(node) else []
-            if name not in known:
-                raise ConfigError(_unknown("setting", key, [*choices, *known] if i == 0 else known))
-            node = getattr(node, name)
+    choices: dict[str, Sequence[str]] = {"terrain": terrains.kinds(), "method": METHODS}
+    key, equals, value = argument.partition("=")
+    if key.startswith(("hydra", "+", "~")):
+        return argument
+    if not equals:
+        raise UsageError(f"'{argument}' isn't of the form key=value, e.g. terrain=poles")
+    if key in choices:
+        for name in value.split(","):  # a sweep has several
+            if name not in choices[key]:
+                raise UsageError(unknown(key, name, choices[key]))
+        return argument
+    default: Any = default_config()
+    for i, name in enumerate(key.split(".")):
+        known = [f.name for f in dataclasses.fields(default)] if dataclasses.is_dataclass(default) else []
+        if name not in known:
+            raise UsageError(unknown("setting", key, [*choices, *known] if i == 0 else known))
+        default = getattr(default, name)
+    if dataclasses.is_dataclass(default):
+        raise UsageError(
+            f"{key} is a group of settings, e.g. {key}.{dataclasses.fields(default)[0].name}={value}"
+        )
+    if type(default) in (int, float, bool):
+        value = ",".join(_number(key, part, type(default)) for part in value.split(","))
+    return f"{key}={value}"
 
 
-def _unknown(what: str, name: str, known: Sequence[str]) -> str:
-    close = difflib.get_close_matches(name.rpartition(".")[2], known, n=1)
-    hint = f" (did you mean {close[0]}?)" if close else ""
-    return f"unknown {what} '{name}'{hint}; choose one of {', '.join(known)}"
+def _number(key: str, text: str, kind: type) -> str:
+    """Hydra's spelling of a number or truth value: 2e6 is a whole number too."""
+    if kind is bool:
+        if text.lower() in ("true", "false"):
+            return text
+        raise UsageError(f"{key}={text} isn't true or false")
+    try:
+        number = float(text)
+        if kind is int and number != int(number):
+            raise ValueError
+    except (ValueError, OverflowError):
+        raise UsageError(f"{key}={text} isn't a {'whole ' if kind is int else ''}number") from None
+    plain = text.lstrip("+-").replace("_", "").isdigit()
+    return text if kind is float or plain else str(int(number))
+
+
+def _try(arguments: Sequence[str]) -> None:
+    from hydra import compose, initialize_config_dir
+    from hydra.errors import HydraException
+    from omegaconf.errors import OmegaConfBaseException
+
+    try:
+        with initialize_config_dir(str(Path(__file__).parent / "conf"), version_base=None):
+            compose("train", list(arguments))
+    except (HydraException, OmegaConfBaseException) as error:
+        why = str(error.__cause__ or error).partition("\n")[0]
+        raise UsageError(f"{why} ({' '.join(arguments)})") from None
 
 
 def from_hydra(node: Any, overrides: Sequence[str] = ()) -> TrainConfig:
@@ -170,13 +219,15 @@ def _resumed(data: dict[str, Any], overrides: Sequence[str]) -> dict[str, Any]:
 
     path = Path(data["run"]) / "config.yaml"
     if not data["run"] or not path.exists():
-        raise ConfigError(f"run={data['run']} holds no run to resume")
+        raise UsageError(f"run={data['run']} holds no run to resume")
     saved = OmegaConf.to_container(OmegaConf.load(path))
     groups = {"terrain": saved["env"]["terrain"]["kind"], "method": saved["env"]["method"]}
     for override in overrides:
-        key, _, value = override.partition("=")
+        key, _, value = override.lstrip("+").partition("=")
         if groups.get(key, value) != value:
-            raise ConfigError(f"{path} has {key}={groups[key]}; to train it further on another one, use init={data['run']}")
+            raise UsageError(
+                f"{path} has {key}={groups[key]}; for another one, start a run with init={data['run']}"
+            )
         if key in groups:
             continue
         new, old = data, saved
@@ -193,7 +244,7 @@ def build(cls: Any, data: dict[str, Any]) -> Any:
     defaults = {f.name: f for f in dataclasses.fields(cls)}
     unknown = [k for k in data if k not in defaults]
     if unknown:
-        raise ConfigError(_unknown("setting", unknown[0], list(defaults)))
+        raise UsageError(unknown("setting", unknown[0], list(defaults)))
     values = {}
     for name, value in data.items():
         kind = hints[name]
@@ -203,7 +254,8 @@ def build(cls: Any, data: dict[str, Any]) -> Any:
             import envs
 
             kind = envs.EnvConfig
-        values[name] = build(kind, value) if isinstance(value, dict) and dataclasses.is_dataclass(kind) else _tuples(value)
+        nested = isinstance(value, dict) and dataclasses.is_dataclass(kind)
+        values[name] = build(kind, value) if nested else _tuples(value)
     return cls(**values)
 
 
@@ -212,19 +264,33 @@ def _tuples(value: Any) -> Any:
 
 
 def validate(config: TrainConfig) -> None:
-    """Raises ConfigError for values that no type excludes."""
+    """Raises UsageError for values that no type excludes."""
     from tlq.memory import KINDS
 
     if config.policy.memory not in KINDS:
-        raise ConfigError(_unknown("policy.memory", config.policy.memory, KINDS))
-    for key in ("num_envs", "steps", "keep"):
-        if getattr(config, key) <= 0:
-            raise ConfigError(f"{key}={getattr(config, key)} must be positive")
+        raise UsageError(unknown("policy.memory", config.policy.memory, KINDS))
+    positive = ("num_envs", "steps", "keep", "policy.memory_layers", "policy.memory_width")
+    for key in (
+        *positive,
+        "ppo.unroll",
+        "ppo.epochs",
+        "ppo.minibatches",
+        "ppo.learning_rate",
+        "policy.initial_std",
+    ):
+        value: Any = config
+        for name in key.split("."):
+            value = getattr(value, name)
+        if value <= 0:
+            raise UsageError(f"{key}={value} must be positive")
     if config.num_envs % config.ppo.minibatches:
-        raise ConfigError(f"num_envs={config.num_envs} must be a multiple of ppo.minibatches={config.ppo.minibatches}")
+        raise UsageError(
+            f"num_envs={config.num_envs} must be a multiple of ppo.minibatches={config.ppo.minibatches}"
+        )
 
 
 def default_run(config: TrainConfig) -> str:
+    """runs/<terrain>-<method>-<date-time>."""
     return f"runs/{config.env.terrain.kind}-{config.env.method}-{time.strftime('%Y%m%d-%H%M%S')}"
 
 
@@ -232,7 +298,7 @@ def save_config(config: TrainConfig, path: Path) -> None:
     """Writes the resolved configuration as YAML."""
     from omegaconf import OmegaConf
 
-    OmegaConf.save(OmegaConf.create(dataclasses.asdict(config)), path)
+    OmegaConf.save(OmegaConf.create(dataclasses.asdict(dataclasses.replace(config, resume=False))), path)
 
 
 def load_config(path: Path) -> TrainConfig:
@@ -248,9 +314,3 @@ def use_cache(folder: str) -> None:
 
     if folder:
         jax.config.update("jax_compilation_cache_dir", os.path.expanduser(folder))
-
-
-def fail(error: Exception) -> typing.NoReturn:
-    """One line and exit code 1."""
-    print(f"error: {' '.join(str(error).split())}", file=sys.stderr, flush=True)
-    sys.exit(1)

@@ -31,6 +31,7 @@ class Logger:
             self._drop_after(iteration)
         self._events = SummaryWriter(str(folder), purge_step=iteration or None, flush_secs=30)
         self._spoken = -math.inf
+        self._rate, self._written = 0.0, 0  # steps per second, smoothed; rows of this process
 
     def write(self, figures: dict[str, float]) -> None:
         """figures: 'iteration', 'env_steps', 'steps_per_second' and whatever else was measured."""
@@ -45,9 +46,13 @@ class Logger:
         for name, value in figures.items():
             if math.isfinite(value):
                 self._events.add_scalar(name, value, int(figures["env_steps"]))
+        # The first iteration compiles: its rate says nothing about the next ones.
+        rate = figures["steps_per_second"]
+        self._rate = rate if self._written < 2 else 0.9 * self._rate + 0.1 * rate
+        self._written += 1
         if time.monotonic() - self._spoken >= self.every:
             self._spoken = time.monotonic()
-            print(text_line(figures, self.total_steps), flush=True)
+            print(text_line(figures | {"steps_per_second": self._rate}, self.total_steps), flush=True)
 
     def _drop_after(self, iteration: int) -> None:
         if not self._path.exists():
@@ -73,7 +78,9 @@ class Logger:
             return
         figure, axes = plt.subplots(2, 3, figsize=(12, 6), sharex=True, constrained_layout=True)
         for axis, name in zip(axes.flat, CURVES, strict=True):
-            axis.plot([row["env_steps"] / 1e6 for row in rows], [row.get(name, math.nan) for row in rows], lw=1)
+            axis.plot(
+                [row["env_steps"] / 1e6 for row in rows], [row.get(name, math.nan) for row in rows], lw=1
+            )
             axis.set_title(name, fontsize=10)
             axis.grid(alpha=0.3)
         for axis in axes[-1]:
@@ -82,6 +89,7 @@ class Logger:
         plt.close(figure)
 
     def close(self) -> None:
+        """Ends the events file."""
         self._events.close()
 
 

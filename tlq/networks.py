@@ -54,21 +54,29 @@ class RecurrentNormalTanh(NormalTanhDistribution):
     """
 
     def create_dist(self, parameters: dict[str, jax.Array]) -> Any:
+        """Distribution of the action before tanh."""
         return super().create_dist(parameters["action"])
 
-    def sample_no_postprocessing(self, parameters: dict[str, jax.Array], seed: jax.Array) -> dict[str, jax.Array]:
+    def sample_no_postprocessing(
+        self, parameters: dict[str, jax.Array], seed: jax.Array
+    ) -> dict[str, jax.Array]:
+        """A draw before tanh; the carry goes along."""
         return {"action": self.create_dist(parameters).sample(seed), "carry": parameters["carry"]}
 
     def mode(self, parameters: dict[str, jax.Array]) -> dict[str, jax.Array]:
+        """The mean, squashed; the carry goes along."""
         return self.postprocess({"action": self.create_dist(parameters).mode(), "carry": parameters["carry"]})
 
     def postprocess(self, event: dict[str, jax.Array]) -> dict[str, jax.Array]:
+        """tanh of the action."""
         return dict(event, action=super().postprocess(event["action"]))
 
     def inverse_postprocess(self, event: dict[str, jax.Array]) -> dict[str, jax.Array]:
+        """arctanh of the action."""
         return dict(event, action=super().inverse_postprocess(event["action"]))
 
     def log_prob(self, parameters: dict[str, jax.Array], actions: dict[str, jax.Array]) -> jax.Array:
+        """Log-density (..) of the squashed action, given the action before tanh."""
         return super().log_prob(parameters, actions["action"])
 
 
@@ -77,7 +85,8 @@ def _head_bias(initial_std: float) -> Callable[..., jax.Array]:
 
     def init(key: jax.Array, shape: tuple[int, ...], dtype: Any = jnp.float32) -> jax.Array:
         half = shape[0] // 2
-        return jnp.concatenate([jnp.zeros(half), jnp.full(half, jnp.log(jnp.expm1(initial_std - MIN_STD)))]).astype(dtype)
+        raw = jnp.log(jnp.expm1(initial_std - MIN_STD))
+        return jnp.concatenate([jnp.zeros(half), jnp.full(half, raw)]).astype(dtype)
 
     return init
 
@@ -111,7 +120,9 @@ class Policy(nn.Module):
         # x skips the memory, so that reflexes don't have to pass through it.
         y = nn.elu(Dense(c.head, name="head")(jnp.concatenate([x, y], axis=-1)))
         small = nn.initializers.variance_scaling(0.01**2, "fan_in", "truncated_normal")
-        out = Dense(2 * self.action_size, kernel_init=small, bias_init=_head_bias(c.initial_std), name="action")
+        out = Dense(
+            2 * self.action_size, kernel_init=small, bias_init=_head_bias(c.initial_std), name="action"
+        )
         return {"action": out(y), "carry": carry}
 
 
@@ -122,6 +133,7 @@ class Critic(nn.Module):
 
     @nn.compact
     def __call__(self, privileged_state: jax.Array) -> jax.Array:
+        """(.., V) -> (..)."""
         x = privileged_state
         for i, width in enumerate(self.widths):
             x = nn.elu(Dense(width, name=f"hidden_{i}")(x))
@@ -132,7 +144,9 @@ def _size(shape: Any) -> int:
     return shape if isinstance(shape, int) else shape[-1]
 
 
-def _normalised(preprocess: Callable[..., Any], statistics: Any, obs: dict[str, jax.Array], key: str) -> jax.Array:
+def _normalised(
+    preprocess: Callable[..., Any], statistics: Any, obs: dict[str, jax.Array], key: str
+) -> jax.Array:
     if preprocess is not normalise:  # Brax's identity takes whatever it is given
         return preprocess(obs, statistics)[key]
     part = NestedMeanStd(mean={key: statistics.mean[key]}, std={key: statistics.std[key]})
@@ -169,7 +183,9 @@ def make_networks(
         return policy.apply(params, proprio, split(obs["state"])[1], carry, obs["is_first"])
 
     def value_apply(statistics: Any, params: Any, obs: dict[str, jax.Array]) -> jax.Array:
-        return critic.apply(params, _normalised(preprocess_observations_fn, statistics, obs, "privileged_state"))
+        return critic.apply(
+            params, _normalised(preprocess_observations_fn, statistics, obs, "privileged_state")
+        )
 
     return PPONetworks(
         policy_network=FeedForwardNetwork(init=policy_init, apply=policy_apply),

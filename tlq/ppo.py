@@ -7,6 +7,7 @@ every environment, then `epochs` passes over M minibatches. Environments are spl
 
 import dataclasses
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import flax
@@ -56,7 +57,7 @@ class PPOConfig:
     """Weight of the value loss (which has a factor 1/2 of its own)."""
     max_grad_norm: float = 1.0
     """The gradient is scaled down to this norm."""
-    reward_scaling: float = 1.0
+    reward_scaling: float = 0.1
     """Factor on the reward."""
 
 
@@ -92,6 +93,21 @@ def make_mesh(num_devices: int = 0) -> Mesh:
     return Mesh(np.array(devices[: num_devices or len(devices)]), (AXIS,))
 
 
+def hoist(function: Callable[..., Any], *example: Any) -> tuple[list[Any], Callable[..., Any]]:
+    """(constants, f) such that f(constants, *arguments) = function(*arguments), for arguments shaped like the example.
+
+    A bank of terrains that a jitted function closes over becomes part of the program: it is compiled anew for every
+    bank and fills the compilation cache. As an argument it does neither.
+    """
+    closed, shape = jax.make_jaxpr(function, return_shape=True)(*example)
+    structure = jax.tree.structure(shape)
+
+    def pure(constants: list[Any], *arguments: Any) -> Any:
+        return structure.unflatten(jax.core.eval_jaxpr(closed.jaxpr, constants, *jax.tree.leaves(arguments)))
+
+    return closed.consts, pure
+
+
 def adapt_learning_rate(rate: jax.Array, kl: jax.Array, config: PPOConfig) -> jax.Array:
     """Halves the rate above twice the target KL, raises it by 1.5 below half of it, within its bounds."""
     if config.kl_target <= 0:
@@ -106,7 +122,9 @@ class Learner:
     env: batched, with the carry in its observation (`RecurrentWrapper`). num_envs: B over all devices.
     """
 
-    def __init__(self, env: Env, networks: PPONetworks, config: PPOConfig, num_envs: int, mesh: Mesh | None = None):
+    def __init__(
+        self, env: Env, networks: PPONetworks, config: PPOConfig, num_envs: int, mesh: Mesh | None = None
+    ):
         self.env, self.networks, self.config, self.num_envs = env, networks, config, num_envs
         self.mesh = mesh or make_mesh()
         self.devices = self.mesh.devices.size
@@ -116,7 +134,9 @@ class Learner:
                 f"{self.devices} x {config.minibatches}"
             )
         self.steps_per_iteration = num_envs * config.unroll
-        self._optimiser = optax.chain(optax.clip_by_global_norm(config.max_grad_norm), optax.scale_by_adam(eps=1e-5))
+        self._optimiser = optax.chain(
+            optax.clip_by_global_norm(config.max_grad_norm), optax.scale_by_adam(eps=1e-5)
+        )
         self._loss = functools.partial(
             compute_ppo_loss,
             ppo_network=networks,
@@ -128,29 +148,60 @@ class Learner:
             vf_coefficient=config.value_loss,
         )
         self.specs = TrainState(P(), P(), P(), P(), P(AXIS), P(), P())
+        self._hoist()
         # Nothing is donated: the state before an update stays whole, so that a failed one can be saved and replayed.
         # That costs one env_state; the rollout, which is ten times larger, lives inside the call.
-        self.step = jax.jit(
+        self._jitted = jax.jit(
             jax.shard_map(
-                self._iteration, mesh=self.mesh, in_specs=(self.specs,), out_specs=(self.specs, P()), check_vma=False
+                self._iteration,
+                mesh=self.mesh,
+                in_specs=(P(), self.specs),
+                out_specs=(self.specs, P()),
+                check_vma=False,
             )
         )
+
+    def step(self, state: TrainState) -> tuple[TrainState, dict[str, jax.Array]]:
+        """One iteration: the next state, and the figures () of this one."""
+        return self._jitted(self._step_constants, state)
 
     # -- state ---------------------------------------------------------------------------------------------------------
 
     def init(self, seed: int) -> TrainState:
         """State before the first iteration, placed on the mesh."""
-        return jax.jit(self._init, out_shardings=self.shardings())(jax.random.PRNGKey(seed))
+        init = jax.jit(self._init, out_shardings=self.shardings())
+        return init(self._reset_constants, jax.random.PRNGKey(seed))
 
     def shardings(self) -> TrainState:
         """Sharding of every part of the state."""
-        return jax.tree.map(lambda spec: NamedSharding(self.mesh, spec), self.specs, is_leaf=lambda x: isinstance(x, P))
+        return jax.tree.map(
+            lambda spec: NamedSharding(self.mesh, spec), self.specs, is_leaf=lambda x: isinstance(x, P)
+        )
 
-    def _init(self, key: jax.Array) -> TrainState:
+    def _hoist(self) -> None:
+        """Splits the environment into functions and the arrays they close over, which are put on every device."""
+        keys = jax.eval_shape(lambda: jax.random.split(jax.random.PRNGKey(0), self.num_envs))
+        env_state = jax.eval_shape(self.env.reset, keys)
+        here = self.num_envs // self.devices
+        env_state = jax.tree.map(lambda x: jax.ShapeDtypeStruct((here, *x.shape[1:]), x.dtype), env_state)
+        action = {
+            "action": jax.ShapeDtypeStruct((here, self.env.action_size), jnp.float32),
+            "carry": env_state.obs["carry"],
+        }
+        reset_constants, self._env_reset = hoist(self.env.reset, keys)
+        step_constants, self._env_step = hoist(self.env.step, env_state, action)
+        # One copy of what both need.
+        everywhere = NamedSharding(self.mesh, P())
+        placed = {id(x): jax.device_put(x, everywhere) for x in [*reset_constants, *step_constants]}
+        self._reset_constants = [placed[id(x)] for x in reset_constants]
+        self._step_constants = [placed[id(x)] for x in step_constants]
+
+    def _init(self, constants: list[jax.Array], key: jax.Array) -> TrainState:
         key, key_env, key_policy, key_value = jax.random.split(key, 4)
-        env_state = self.env.reset(jax.random.split(key_env, self.num_envs))
+        env_state = self._env_reset(constants, jax.random.split(key_env, self.num_envs))
         params = PPONetworkParams(
-            policy=self.networks.policy_network.init(key_policy), value=self.networks.value_network.init(key_value)
+            policy=self.networks.policy_network.init(key_policy),
+            value=self.networks.value_network.init(key_value),
         )
         # std_eps: an observation that hardly varies isn't blown up (least standard deviation 0.01).
         seen = {name: jnp.zeros(env_state.obs[name].shape[1:]) for name in NORMALISED}
@@ -168,12 +219,16 @@ class Learner:
 
     # -- one iteration, on each device ---------------------------------------------------------------------------------
 
-    def _iteration(self, state: TrainState) -> tuple[TrainState, dict[str, jax.Array]]:
+    def _iteration(
+        self, constants: list[jax.Array], state: TrainState
+    ) -> tuple[TrainState, dict[str, jax.Array]]:
         key, key_here = jax.random.split(state.key)
         key_rollout, key_update = jax.random.split(jax.random.fold_in(key_here, jax.lax.axis_index(AXIS)))
-        start = state.env_state.obs
-        env_state, rollout, env_metrics = self._rollout(state, key_rollout)
-        params, opt_state, losses = self._update(state, start["carry"], rollout, env_state.obs, key_update)
+        carry = state.env_state.obs["carry"]
+        env_state, rollout, env_metrics = self._rollout(constants, state, key_rollout)
+        params, opt_state, losses = self._update(
+            state, carry, rollout, env_state.obs["privileged_state"], key_update
+        )
         # Statistics move after the gradient steps, so that the first ratio of new to old probability is 1.
         # A quarter of the steps says the same at a quarter of the cost.
         normaliser = running_statistics.update(
@@ -182,7 +237,9 @@ class Learner:
         # The very first iteration only looks: a policy isn't trained on observations that aren't normalised yet.
         looking = (state.normaliser.count.hi == 0) & (state.normaliser.count.lo == 0)
         params, opt_state = jax.tree.map(
-            lambda old, new: jnp.where(looking, old, new), (state.params, state.opt_state), (params, opt_state)
+            lambda old, new: jnp.where(looking, old, new),
+            (state.params, state.opt_state),
+            (params, opt_state),
         )
         kl = jnp.where(looking, self.config.kl_target, losses["kl_last"])
         new_state = TrainState(
@@ -196,7 +253,9 @@ class Learner:
         )
         return new_state, {**env_metrics, **losses, "learning_rate": state.learning_rate}
 
-    def _rollout(self, state: TrainState, key: jax.Array) -> tuple[State, Rollout, dict[str, jax.Array]]:
+    def _rollout(
+        self, constants: list[jax.Array], state: TrainState, key: jax.Array
+    ) -> tuple[State, Rollout, dict[str, jax.Array]]:
         """T steps with sampled actions; metrics are sums over T and means over B, see `summarise`."""
         policy, distribution = self.networks.policy_network, self.networks.parametric_action_distribution
 
@@ -204,7 +263,7 @@ class Learner:
             obs = env_state.obs
             parameters = policy.apply(state.normaliser, state.params.policy, obs)
             raw = distribution.sample_no_postprocessing(parameters, key)
-            after = self.env.step(env_state, distribution.postprocess(raw))
+            after = self._env_step(constants, env_state, distribution.postprocess(raw))
             rollout = Rollout(
                 observation={k: obs[k] for k in (*NORMALISED, "is_first")},
                 action=raw["action"],
@@ -223,8 +282,13 @@ class Learner:
         metrics = jax.tree.map(lambda x: jax.lax.pmean(jnp.mean(x, axis=0), AXIS), metrics)
         return env_state, rollout, summarise(metrics, self.steps_per_iteration)
 
-    def _update(self, state: TrainState, carry: jax.Array, rollout: Rollout, last: dict[str, jax.Array], key: jax.Array):
-        """`epochs` passes of gradient steps; carry (B, C) before the first step, `last` observation after the last."""
+    def _update(
+        self, state: TrainState, carry: jax.Array, rollout: Rollout, last: jax.Array, key: jax.Array
+    ) -> tuple[PPONetworkParams, Any, dict[str, jax.Array]]:
+        """`epochs` passes of gradient steps.
+
+        carry: (B, C) from before the first step; last: (B, V) 'privileged_state' after the last.
+        """
         c = self.config
         envs = rollout.reward.shape[1]
         key_order, key_loss = jax.random.split(key)
@@ -234,8 +298,10 @@ class Learner:
         def gradient_step(carried, inputs):
             params, opt_state = carried
             index, key = inputs
-            batch = as_transition(jax.tree.map(lambda x: x[:, index], rollout), carry[index], last["privileged_state"][index])
-            (_, losses), grads = jax.value_and_grad(self._loss, has_aux=True)(params, state.normaliser, batch, key)
+            batch = as_transition(jax.tree.map(lambda x: x[:, index], rollout), carry[index], last[index])
+            (_, losses), grads = jax.value_and_grad(self._loss, has_aux=True)(
+                params, state.normaliser, batch, key
+            )
             grads, losses = jax.lax.pmean((grads, losses), AXIS)
             updates, opt_state = self._optimiser.update(grads, opt_state)
             params = optax.apply_updates(params, jax.tree.map(lambda u: -state.learning_rate * u, updates))

@@ -1,6 +1,6 @@
 """A training run: environment, networks and PPO put together, and the folder that a run leaves behind.
 
-    run/config.yaml  metrics.csv  events.*  curve.png  policy.npz  checkpoints/  failed/ (after a failed update)
+run/config.yaml  metrics.csv  events.*  curve.png  policy.npz  checkpoints/  failed/ (after a failed update)
 """
 
 import contextlib
@@ -30,7 +30,9 @@ class TrainingFailed(RuntimeError):
 def wrap(env: Env, config: TrainConfig) -> Env:
     """Batched environment with the policy's memory in its observation; `env` is one that resets itself."""
     c = config.policy
-    return memory.RecurrentWrapper(VmapWrapper(env), memory.carry_size(c.memory, c.memory_layers, c.memory_width))
+    return memory.RecurrentWrapper(
+        VmapWrapper(env), memory.carry_size(c.memory, c.memory_layers, c.memory_width)
+    )
 
 
 def make_learner(config: TrainConfig, env: Env | None = None, heights: int | None = None) -> Learner:
@@ -47,16 +49,17 @@ def make_learner(config: TrainConfig, env: Env | None = None, heights: int | Non
 
 def train(config: TrainConfig, env: Env | None = None, heights: int | None = None) -> dict[str, float]:
     """Runs or resumes a training run in `config.run`; returns the figures of its last iteration."""
-    folder = open_folder(config)
+    folder = check_folder(config)
+    print(f"run {folder}: building terrain and program, which takes a minute or two", flush=True)
     learner = make_learner(config, env, heights)
     state = learner.init(config.seed)
+    if config.init and not config.resume:
+        state = initialise(state, config.init)
+    folder.mkdir(parents=True, exist_ok=True)
     checkpoints = Checkpoints(folder / "checkpoints", config.keep)
     if config.resume:
         state, _ = checkpoints.restore(state)
-    elif config.init:
-        state = initialise(state, config.init)
-    if not config.resume:
-        save_config(config, folder / "config.yaml")
+    save_config(config, folder / "config.yaml")
     logger = Logger(folder, config.steps, int(state.iteration), config.log_every)
     try:
         return _loop(config, learner, state, checkpoints, logger)
@@ -96,27 +99,34 @@ def _loop(
                 stop.append(0)
     if saved != iteration:
         save(config, learner, state, checkpoints, logger)
-    if stop:
-        print(f"stopped at {iteration * learner.steps_per_iteration} steps; go on with run={config.run} resume=true")
+    steps = iteration * learner.steps_per_iteration
+    if not figures:
+        print(f"{config.run} has its {steps} steps already; set steps= to a larger number to go on")
+    elif stop:
+        print(f"stopped at {steps} steps; go on with run={config.run} resume=true")
     return figures
 
 
-def save(config: TrainConfig, learner: Learner, state: TrainState, checkpoints: Checkpoints, logger: Logger) -> None:
+def save(
+    config: TrainConfig, learner: Learner, state: TrainState, checkpoints: Checkpoints, logger: Logger
+) -> None:
     """Checkpoint, exported policy and picture of the run so far."""
     iteration = int(state.iteration)
-    checkpoints.save(iteration, state, {"env_steps": iteration * learner.steps_per_iteration, "seed": config.seed})
+    env_steps = iteration * learner.steps_per_iteration
+    checkpoints.save(iteration, state, {"env_steps": env_steps, "seed": config.seed})
     if jax.process_index() == 0:
         logger.draw()
-        export(config, state)
+        export(config, state, env_steps)
 
 
-def export(config: TrainConfig, state: TrainState) -> None:
-    """Refreshes policy.npz."""
-    try:
-        from tlq.export import export_policy
-    except ImportError:
+def export(config: TrainConfig, state: TrainState, env_steps: int) -> None:
+    """Refreshes policy.npz; a run on an environment that isn't the quadruped has none."""
+    if config.env is None:
         return
-    export_policy(Path(config.run) / "policy.npz", config=config, params=state.params.policy, normaliser=state.normaliser)
+    from tlq.export import export_policy
+
+    path = Path(config.run) / "policy.npz"
+    export_policy(path, config, state.params.policy, state.normaliser, {"env_steps": env_steps})
 
 
 def save_failed(config: TrainConfig, before: TrainState, iteration: int) -> str:
@@ -136,11 +146,9 @@ def initialise(state: TrainState, source: str) -> TrainState:
     path = Path(source)
     if path.is_dir():
         arrays = read_arrays(path / "checkpoints" if (path / "checkpoints").is_dir() else path)
-    elif path.is_file():
+    else:
         with np.load(path) as file:
             arrays = {k: file[k] for k in file.files}
-    else:
-        raise ValueError(f"init={source}: no such run folder or policy file")
     parts = {"params": state.params, "normaliser": state.normaliser}
     taken = []
 
@@ -160,15 +168,18 @@ def initialise(state: TrainState, source: str) -> TrainState:
     return state.replace(params=parts["params"], normaliser=parts["normaliser"])
 
 
-def open_folder(config: TrainConfig) -> Path:
+def check_folder(config: TrainConfig) -> Path:
     """The run's folder; it must be new, or hold a run if `resume` is set."""
     folder = Path(config.run)
     if config.resume:
         if not (folder / "config.yaml").exists():
             raise ValueError(f"run={folder} holds no run to resume")
-    elif folder.exists() and any(folder.iterdir()):
-        raise ValueError(f"run={folder} exists already; add resume=true to go on with it, or choose another name")
-    folder.mkdir(parents=True, exist_ok=True)
+    elif folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise ValueError(
+            f"run={folder} exists already; add resume=true to go on with it, or choose another name"
+        )
+    if config.init and not Path(config.init).exists():
+        raise ValueError(f"init={config.init}: no such run folder or policy file")
     return folder
 
 

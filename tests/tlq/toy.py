@@ -21,7 +21,9 @@ class ToyEnv(Env):
         inner = self._begin(rng)
         zero = jnp.float32(0)
         metrics = {f"reward/{k}": zero for k in ("match", "effort")} | {"level": zero + 0.5}
-        metrics |= {f"episode/{k}": zero for k in ("ended", "distance", "length", "fell", "level", "exploded")}
+        metrics |= {
+            f"episode/{k}": zero for k in ("ended", "distance", "length", "fell", "level", "exploded")
+        }
         return State(inner, self._observe(inner), zero, zero, metrics, {"truncation": zero})
 
     def step(self, state, action):
@@ -37,10 +39,16 @@ class ToyEnv(Env):
         inner = jax.tree.map(lambda a, b: jnp.where(done > 0, a, b), self._begin(key_next), inner)
         metrics = dict(state.metrics) | {"reward/match": match, "reward/effort": effort}
         metrics |= {
-            "episode/ended": done, "episode/distance": distance * done, "episode/length": length * done,
-            "episode/fell": fell, "episode/level": 0.5 * done, "episode/exploded": 0 * done,
+            "episode/ended": done,
+            "episode/distance": distance * done,
+            "episode/length": length * done,
+            "episode/fell": fell,
+            "episode/level": 0.5 * done,
+            "episode/exploded": 0 * done,
         }
-        return State(inner, self._observe(inner), match + effort, done, metrics, {"truncation": done * (1 - fell)})
+        return State(
+            inner, self._observe(inner), match + effort, done, metrics, {"truncation": done * (1 - fell)}
+        )
 
     def _begin(self, key):
         key, key_target = jax.random.split(key)
@@ -52,6 +60,8 @@ class ToyEnv(Env):
         state = jnp.zeros(self.proprio + self.heights).at[0].set(shown).at[1].set(s["length"])
         return {"state": state, "privileged_state": jnp.zeros(self.privileged).at[0].set(s["target"])}
 
-    observation_size = property(lambda self: {"state": self.proprio + self.heights, "privileged_state": self.privileged})
+    observation_size = property(
+        lambda self: {"state": self.proprio + self.heights, "privileged_state": self.privileged}
+    )
     action_size = property(lambda self: ACTIONS)
     backend = property(lambda self: "mjx")

@@ -1,0 +1,298 @@
+"""Walks a trained policy over terrains that training never saw, and measures how it does.
+
+    python -m tlq.evaluate policy=FILE terrain=poles engine=mjx difficulty=paper episodes=18 seed=0 json=FILE
+
+The robot starts with yaw 0 in the middle of the start platform and is told one direction of the paper's six, fixed in
+the world. An episode ends at 5 m, at a fall, or after 10 s without progress. The policy acts by its mode.
+"""
+
+import concurrent.futures
+import dataclasses
+import json
+import math
+import multiprocessing
+import os
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import envs
+import terrains
+from tlq import judge
+from tlq.cli import find_policy, option, parse, run
+from tlq.config import build
+from tlq.runtime import Controller, load_policy
+
+ENGINES = ("mjx", "mujoco")
+DIRECTIONS = (0.0, math.pi / 4, -math.pi / 4, -math.pi, -5 * math.pi / 4, -3 * math.pi / 4)
+"""The paper's, rad; episode k takes number k % 6."""
+FIRST_SEED = 10_000
+"""Training's terrains have seeds below."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """What a user may set."""
+
+    policy: str = option(
+        "", "policy file, run folder, or name of a policy that comes with tlq", required=True
+    )
+    terrain: str = option("poles", "kind of terrain", choices=terrains.kinds)
+    engine: str = option(
+        "mjx", "mjx, as in training; mujoco: MuJoCo C on true geometry", choices=lambda: ENGINES
+    )
+    difficulty: str = option("paper", "number in [0, 1], or paper")
+    episodes: int = option(18, "number of episodes")
+    seed: int = option(0, "of the terrains (10,000 more than this) and of the noise")
+    json: str = option("", "file to write the results to")
+    noise: bool = option(False, "errors of sensors and map as in training")
+    timestep: float = option(0.002, "of the physics (s); engine=mujoco only")
+    workers: int = option(1, "processes; engine=mujoco only")
+
+
+def evaluate(options: Options, report: Callable[[str], None] = print) -> dict[str, Any]:
+    """Runs the episodes; returns what the JSON file holds.
+
+    Args:
+      options: what to run.
+      report: takes lines of text on the progress.
+    """
+    _check(options)
+    path = find_policy(options.policy)
+    policy = load_policy(path)
+    walk = _walk_mujoco if options.engine == "mujoco" else _walk_mjx
+    tallies = walk(options, path, policy.metadata, report)
+    return summary(options, policy.metadata, tallies)
+
+
+def _check(options: Options) -> None:
+    terrains.parse_difficulty(options.difficulty)
+    for name in ("episodes", "workers"):
+        if getattr(options, name) < 1:
+            raise ValueError(f"{name}={getattr(options, name)} must be at least 1")
+    if options.seed < 0:
+        raise ValueError(f"seed={options.seed} must be 0 or more")
+    if not 0 < options.timestep <= 0.02:
+        raise ValueError(f"timestep={options.timestep} must be in (0, 0.02]")
+    folder = Path(options.json).absolute().parent
+    if options.json and not folder.is_dir():
+        raise ValueError(f"json={options.json}: there is no folder {folder}")
+
+
+# -- engines ---------------------------------------------------------------------------------------------------------
+
+
+def direction(k: int) -> np.ndarray:
+    """Unit vector (2,) of episode k."""
+    angle = DIRECTIONS[k % len(DIRECTIONS)]
+    return np.array([math.cos(angle), math.sin(angle)])
+
+
+def start_phase(k: int) -> float:
+    """Phase (rad) of episode k: one pair of legs swings first in one round of directions, the other in the next."""
+    return 0.5 * math.pi * (-1) ** (k // len(DIRECTIONS))
+
+
+def training_env(metadata: dict[str, Any]) -> envs.EnvConfig:
+    """The environment a policy was trained in."""
+    return build(envs.EnvConfig, metadata["training"]["env"])
+
+
+def _walk_mjx(options: Options, path: Path, metadata: dict[str, Any], report: Any) -> list[judge.Tally]:
+    from tlq import batch
+
+    count = options.episodes
+    sizes = terrains.TerrainConfig(kind=options.terrain, num_terrains=count, seed=FIRST_SEED + options.seed)
+    level = terrains.parse_difficulty(options.difficulty)
+    report(f"building {count} terrains, compiling")
+    env = envs.make(batch.evaluation_config(training_env(metadata), sizes, level, options.noise))
+    began = time.monotonic()
+
+    def progress(tally: judge.Tally) -> None:
+        ended = int(np.sum(tally.ended != judge.RUNNING))
+        line = f"{ended} of {count} episodes ended, {np.minimum(tally.progress, judge.GOAL).mean():.2f} m"
+        report(f"{line} on average, {time.monotonic() - began:.0f} s")
+
+    directions = np.array([direction(k) for k in range(count)])
+    phases = np.array([start_phase(k) for k in range(count)])
+    found = batch.walk(load_policy(path), env, directions, phases, seed=options.seed, report=progress)
+    return [judge.Tally(*(leaf[k] for leaf in found)) for k in range(count)]
+
+
+def _walk_mujoco(options: Options, path: Path, metadata: dict[str, Any], report: Any) -> list[judge.Tally]:
+    tallies: list[Any] = [None] * options.episodes
+
+    def done(k: int, tally: judge.Tally) -> None:
+        tallies[k] = tally
+        ended = sum(t is not None for t in tallies)
+        report(f"episode {k}: {describe(tally, metadata['control_dt'])} ({ended} of {options.episodes})")
+
+    if options.workers == 1:
+        for k in range(options.episodes):
+            done(k, mujoco_episode(options, path, k))
+        return tallies
+    context = multiprocessing.get_context("spawn")  # JAX's threads don't survive a fork
+    with concurrent.futures.ProcessPoolExecutor(min(options.workers, options.episodes), context) as pool:
+        jobs = {pool.submit(mujoco_episode, options, path, k): k for k in range(options.episodes)}
+        for job in concurrent.futures.as_completed(jobs):
+            done(jobs[job], job.result())
+    return tallies
+
+
+def mujoco_episode(options: Options, path: Path, k: int) -> judge.Tally:
+    """Episode k in MuJoCo C."""
+    from tlq.simulation import Simulation
+
+    controller = Controller(path)
+    config = training_env(controller.metadata)
+    seed = FIRST_SEED + options.seed
+    terrain = terrains.make_terrain(options.terrain, options.difficulty, seed, index=k)
+    noise = config.randomisation if options.noise else None
+    simulation = Simulation(
+        controller, terrain, config, timestep=options.timestep, noise=noise, seed=seed + k
+    )
+    simulation.reset(start_phase(k))
+    moment = simulation.moment()
+    tally, origin = judge.begin(moment), moment.position
+    while tally.ended == judge.RUNNING:
+        moment = simulation.step(direction(k))
+        tally = judge.update(tally, moment, origin, direction(k), controller.control_dt)
+    return tally
+
+
+def describe(tally: judge.Tally, dt: float) -> str:
+    """One episode in words."""
+    progress, time_taken = min(float(tally.progress), judge.GOAL), float(tally.steps) * dt
+    return f"{judge.ENDS[int(tally.ended)]} after {progress:.2f} m and {time_taken:.1f} s"
+
+
+# -- figures ---------------------------------------------------------------------------------------------------------
+
+
+def wilson(successes: int, trials: int, z: float = 1.959964) -> dict[str, float]:
+    """Share of successes and its 95 % Wilson interval: {mean, low, high}."""
+    mean = successes / trials
+    middle = (mean + z * z / (2 * trials)) / (1 + z * z / trials)
+    half = z / (1 + z * z / trials) * math.sqrt(mean * (1 - mean) / trials + z * z / (4 * trials * trials))
+    return {"mean": mean, "low": max(middle - half, 0.0), "high": min(middle + half, 1.0)}
+
+
+def summary(options: Options, metadata: dict[str, Any], tallies: Sequence[judge.Tally]) -> dict[str, Any]:
+    """The figures over all episodes: JSON."""
+    dt = metadata["control_dt"]
+    runs = [_run(k, tally, dt) for k, tally in enumerate(tallies)]
+    distance = np.array([r["distance_m"] for r in runs])
+    swings, walked = sum(float(t.swings) for t in tallies), float(distance.sum())
+    total = {name: sum(float(getattr(t, name)) for t in tallies) for name in ("work", "lift", "unsafe")}
+    return {
+        "terrain": options.terrain,
+        "policy": options.policy,
+        "engine": options.engine,
+        "difficulty": terrains.parse_difficulty(options.difficulty),
+        "episodes": len(runs),
+        "seed": options.seed,
+        "noise": options.noise,
+        "method": metadata["method"],
+        "commit": metadata["commit"],
+        "distance_m": {"mean": distance.mean(), "std": distance.std(), "min": distance.min()},
+        "success_rate": wilson(sum(r["ended_by"] == "reached" for r in runs), len(runs)),
+        "by_direction": _by_direction(runs),
+        "ended_by": {end: sum(r["ended_by"] == end for r in runs) for end in judge.ENDS[1:]},
+        "energy_j_per_m": total["work"] / walked if walked > 0 else None,
+        "swing_height_m": total["lift"] / swings if swings else None,
+        "heading_drift_rad": float(np.mean([abs(r["turned_rad"]) for r in runs])),
+        "unsafe_foothold_share": total["unsafe"] / swings if swings else None,
+        "speed_m_s": walked / sum(r["time_s"] for r in runs),
+        "runs": runs,
+    }
+
+
+def _run(k: int, tally: judge.Tally, dt: float) -> dict[str, Any]:
+    return {
+        "direction_rad": DIRECTIONS[k % len(DIRECTIONS)],
+        "ended_by": judge.ENDS[int(tally.ended)],
+        "distance_m": min(float(tally.progress), judge.GOAL),
+        "time_s": float(tally.steps) * dt,
+        "turned_rad": float(tally.turned),
+    }
+
+
+def _by_direction(runs: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    found = []
+    for angle in DIRECTIONS:
+        part = [r for r in runs if r["direction_rad"] == angle]
+        if part:
+            found.append(
+                {
+                    "direction_rad": angle,
+                    "episodes": len(part),
+                    "distance_m": float(np.mean([r["distance_m"] for r in part])),
+                    "success_rate": sum(r["ended_by"] == "reached" for r in part) / len(part),
+                }
+            )
+    return found
+
+
+def table(result: dict[str, Any]) -> str:
+    """The figures as text."""
+
+    def number(value: float | None, digits: int, unit: str) -> str:
+        return "-" if value is None else f"{value:.{digits}f} {unit}".rstrip()
+
+    distance, success = result["distance_m"], result["success_rate"]
+    low, high = round(100 * success["low"]), round(100 * success["high"])
+    rows = [
+        ("distance", f"{distance['mean']:.3f} m (std {distance['std']:.3f}, min {distance['min']:.3f})"),
+        ("success", f"{100 * success['mean']:.0f} % (95 %: {low} to {high} %)"),
+        ("ended by", ", ".join(f"{end} {count}" for end, count in result["ended_by"].items())),
+        *(
+            (
+                f"  {math.degrees(d['direction_rad']):5.0f}°",
+                f"{d['distance_m']:.3f} m, {100 * d['success_rate']:.0f} %",
+            )
+            for d in result["by_direction"]
+        ),
+        ("speed", number(result["speed_m_s"], 3, "m/s")),
+        ("energy", number(result["energy_j_per_m"], 1, "J/m")),
+        ("swing height", number(result["swing_height_m"], 3, "m")),
+        ("heading drift", number(result["heading_drift_rad"], 3, "rad")),
+        ("unsafe footholds", number(result["unsafe_foothold_share"], 3, "")),
+    ]
+    head = "{terrain}, difficulty {difficulty:g}, {engine}, {episodes} episodes".format(**result)
+    return "\n".join([head, *(f"{name:<18}{value}" for name, value in rows)])
+
+
+def write_json(path: str | os.PathLike[str], result: Any) -> None:
+    """Writes a file whole or not at all."""
+    path = Path(path)
+    handle, name = tempfile.mkstemp(prefix=f".{path.name}-", suffix=".tmp", dir=path.absolute().parent)
+    try:
+        with os.fdopen(handle, "w") as file:
+            json.dump(result, file, indent=2, allow_nan=False)
+            file.write("\n")
+        os.chmod(name, 0o644)
+        os.replace(name, path)
+    except BaseException:
+        os.unlink(name)
+        raise
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Command line."""
+    options = parse(Options, arguments, __doc__ or "")
+    if options.engine == "mjx":
+        from tlq.config import TrainConfig, use_cache
+
+        use_cache(TrainConfig().cache)
+    result = evaluate(options, lambda line: print(line, flush=True))
+    print(table(result))
+    if options.json:
+        write_json(options.json, result)
+
+
+if __name__ == "__main__":
+    run(main)

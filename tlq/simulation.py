@@ -1,0 +1,163 @@
+"""A robot under an exported policy in MuJoCo C, on a terrain's true boxes and cylinders, driven as a real one would be.
+
+Letters: L = 4 legs (LF, RF, LR, RR), J = 12 joints, P = 25 sample points a foot.
+"""
+
+import mujoco
+import numpy as np
+
+import tg
+from envs.config import EnvConfig, RandomisationConfig
+from envs.physics import physics_model, settle
+from envs.robot import read_robot
+from envs.scene import build_scene
+from terrains import Terrain, exact_height
+from tlq.judge import Moment
+from tlq.runtime import Controller
+
+
+class Simulation:
+    """Physics, sensors and perception around a `Controller`. World frame, SI units."""
+
+    def __init__(
+        self,
+        controller: Controller,
+        terrain: Terrain,
+        config: EnvConfig,
+        *,
+        timestep: float = 0.002,
+        noise: RandomisationConfig | None = None,
+        seed: int = 0,
+    ):
+        """Puts the robot on the terrain's start platform.
+
+        Args:
+          controller: of the robot; it is reset by `reset`.
+          terrain: true geometry.
+          config: the robot, and when it counts as fallen.
+          timestep: of the physics (s).
+          noise: errors of sensors and map; none: exact.
+          seed: of the noise.
+        """
+        ratio = controller.control_dt / timestep
+        if timestep <= 0 or abs(ratio - round(ratio)) > 1e-6:
+            raise ValueError(
+                f"timestep={timestep} doesn't divide the control period, {controller.control_dt} s"
+            )
+        self.controller, self.terrain, self.config, self.noise = controller, terrain, config, noise
+        self.model = build_scene(config.robot, terrain, timestep=timestep)
+        self.data = mujoco.MjData(self.model)
+        self.robot = read_robot(self.model, config.robot)
+        self.substeps = round(ratio)
+        self._random = np.random.default_rng(seed)
+        joints = [self.model.joint(name) for name in controller.joint_names]
+        self._q = np.array([joint.qposadr[0] for joint in joints])
+        self._v = np.array([joint.dofadr[0] for joint in joints])
+        self._motors = np.array([self.model.actuator(name).id for name in controller.joint_names])
+        flat, robot = physics_model(config.robot, config.physics_dt, config.num_planes)
+        self._standing = settle(flat, robot, controller.core.standing_target)
+        self._thighs = controller.core.geometry._replace(shank=np.zeros(4, np.float32))
+        self.reset()
+
+    def reset(self, phase: float = 0.5 * np.pi) -> None:
+        """The robot stands on the start platform, yaw 0, at rest; `phase` as in `Controller.reset`."""
+        mujoco.mj_resetData(self.model, self.data)
+        self.data.qpos[:] = self._standing
+        self.data.qpos[2] += exact_height(self.terrain, np.zeros(2))
+        self.controller.reset(phase)
+        if self.noise is not None:
+            drift = np.array([self.noise.map_drift, self.noise.map_drift, self.noise.height_drift])
+            self._offset = drift * self._random.uniform(-1.0, 1.0, 3)
+        self._look()
+
+    def step(self, direction: np.ndarray) -> Moment:
+        """One control period, towards a direction (2,) in the world (a unit vector; 0: stand)."""
+        command = tg.frames.turn(np.asarray(-self.yaw), np.asarray(direction, float))
+        desired = self.controller.step(self._sensors, self._heights, command)
+        work = sum(self._physics(desired) for _ in range(self.substeps))
+        self._look()
+        return self.moment(work)
+
+    def moment(self, work: float = 0.0) -> Moment:
+        """The present state, as the judge sees it."""
+        return Moment(
+            position=self.data.qpos[:2].copy(),
+            yaw=np.asarray(self.yaw),
+            phases=tg.path.leg_phases(self.controller.state.phase),
+            feet=self._feet[:, 2] + self.data.qpos[2],
+            ground=self._ground,
+            work=np.asarray(work),
+            fell=np.asarray(self.fell()),
+        )
+
+    @property
+    def yaw(self) -> float:
+        """Heading of the trunk (rad)."""
+        return float(tg.frames.yaw(self.data.qpos[3:7]))
+
+    def fell(self) -> bool:
+        """Whether trunk or a knee hits the terrain, or the trunk tilts too far; as in `QuadrupedEnv`."""
+        rotation = tg.frames.rotation(self.data.qpos[3:7])
+        q = self.data.qpos[self._q].reshape(4, 3)
+        knees = self._thighs.hip_position + tg.leg.forward(self._thighs, q)
+        points = np.concatenate([self.robot.trunk_points, knees]) @ rotation.T + self.data.qpos[:3]
+        if not np.isfinite(points).all():
+            return True
+        points[-4:, 2] -= self.config.knee_radius
+        hit = points[:, 2] < exact_height(self.terrain, points[:, :2])
+        return bool(hit.any() or rotation[2, 2] < self.config.min_up)
+
+    def _physics(self, desired: np.ndarray) -> float:
+        """One timestep under PD control; returns sum of |torque x speed| dt (J)."""
+        c, data, limit = self.controller, self.data, self.controller.torque_limit
+        speed = data.qvel[self._v]
+        torque = np.minimum(np.maximum(c.kp * (desired - data.qpos[self._q]) - c.kd * speed, -limit), limit)
+        data.ctrl[self._motors] = torque
+        mujoco.mj_step(self.model, data)
+        return float(np.abs(torque) @ np.abs(speed)) * self.model.opt.timestep
+
+    def _look(self) -> None:
+        """Reads sensors, and the terrain at the feet: as it is, and as it is perceived."""
+        data, core = self.data, self.controller.core
+        exact = {
+            "orientation": data.qpos[3:7].copy(),
+            "angular_velocity": data.qvel[3:6].copy(),
+            "joint_position": data.qpos[self._q],
+            "joint_velocity": data.qvel[self._v],
+        }
+        self._feet = core.feet(tg.Sensors(**exact))
+        points = core.sample_points(self._feet)
+        self._ground = self._height(points)
+        self._sensors, self._heights = exact, self._ground - data.qpos[2]
+        if self.noise is not None:
+            self._sensors = noisy(exact, self.noise, self._random)
+            points = self.controller.sample_points(self._sensors) + self._offset[:2]
+            error = self.noise.height_noise * self._random.standard_normal(points.shape[:-1])
+            self._heights = self._height(points) - data.qpos[2] + self._offset[2] + error
+
+    def _height(self, points: np.ndarray) -> np.ndarray:
+        """Terrain height (...) m in the world at points (..., 2) m of the heading frame."""
+        return exact_height(self.terrain, self.data.qpos[:2] + tg.frames.turn(np.asarray(self.yaw), points))
+
+
+def noisy(
+    exact: dict[str, np.ndarray], noise: RandomisationConfig, random: np.random.Generator
+) -> dict[str, np.ndarray]:
+    """Sensors with errors, drawn as in training (`QuadrupedEnv.sense`)."""
+    roll, pitch = 0.5 * noise.tilt_noise * random.standard_normal(2)
+    w, x, y, z = exact["orientation"]
+    turned = np.array(
+        [
+            w - x * roll - y * pitch,
+            x + w * roll - z * pitch,
+            y + w * pitch + z * roll,
+            z + x * pitch - y * roll,
+        ]
+    )
+    deviation = {
+        "angular_velocity": noise.angular_velocity_noise,
+        "joint_position": noise.joint_position_noise,
+        "joint_velocity": noise.joint_velocity_noise,
+    }
+    errors = {k: exact[k] + d * random.standard_normal(exact[k].shape) for k, d in deviation.items()}
+    return {"orientation": turned / np.linalg.norm(turned), **errors}
