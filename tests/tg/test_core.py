@@ -1,0 +1,400 @@
+"""The controller core: what it does with the phase, what it shows, and its symmetries."""
+
+import dataclasses
+import math
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+import tg
+from tests.tg.robots import SUBJECTS
+from tg.core import load_share
+
+LEFT = np.array([math.cos(0.7), math.sin(0.7)])
+"""A command to the front left."""
+STAND = np.zeros(2)
+SWAP = [1, 0, 3, 2]
+"""The legs' mirror images: LF <-> RF, LR <-> RR."""
+
+
+def random_sensors(core, seed, dtype=np.float64):
+    rng = np.random.default_rng(seed)
+    quaternion = np.array([1.0, 0, 0, 0]) + rng.normal(0, 0.15, 4)
+    sensors = tg.Sensors(
+        quaternion / np.linalg.norm(quaternion),
+        rng.normal(0, 1, 3),
+        core.default_pose + rng.normal(0, 0.2, 12),
+        rng.normal(0, 3, 12),
+    )
+    return tg.Sensors(*(np.asarray(part, dtype) for part in sensors))
+
+
+def level_sensors(core, dtype=np.float64):
+    """A level robot in its default pose, at rest."""
+    parts = [1, 0, 0, 0], np.zeros(3), core.default_pose, np.zeros(12)
+    return tg.Sensors(*(np.asarray(part, dtype) for part in parts))
+
+
+def walk(core, steps, command=LEFT, seed=0, state=None, action=None):
+    """States and desired angles of so many steps with random actions, or always the same one."""
+    rng = np.random.default_rng(seed)
+    state = core.initial_state(np.asarray(0.5 * np.pi)) if state is None else state
+    found = []
+    for _ in range(steps):
+        given = rng.uniform(-1.2, 1.2, 14) if action is None else action
+        sensors = level_sensors(core) if action is not None else random_sensors(core, rng.integers(1000))
+        state, desired = core.act(state, given, sensors, command)
+        found.append((state, desired))
+    return found
+
+
+# Phase and gait -----------------------------------------------------------------------------------------------
+
+
+def test_action_sets_frequency_and_lift_within_their_bounds(subject):
+    core = subject.core
+    c = core.config
+    state = core.initial_state(np.asarray(0.5 * np.pi))
+    action = np.zeros(14)
+    for given, share in [(1.0, 1.0), (-0.5, -0.5), (3.0, 1.0)]:  # beyond ±1 is cut off
+        action[:2] = given
+        after, _ = core.act(state, action, level_sensors(core), LEFT)
+        frequency = c.base_frequency + share * c.frequency_range
+        assert after.frequency == pytest.approx(frequency)
+        assert after.phase == pytest.approx(0.5 * np.pi + 2 * np.pi * frequency * core.dt)
+        lift = min(max(c.lift + share * c.lift_range, c.lift_min), c.lift_max)
+        # At π/2 LF and RR are in the air: theirs stays until they have landed.
+        np.testing.assert_allclose(after.lift, [c.lift, lift, lift, c.lift])
+
+
+def test_lift_is_held_from_lift_off_to_touch_down(subject):
+    before = subject.core.initial_state(np.asarray(0.5 * np.pi))
+    for state, _ in walk(subject.core, 200):
+        swing = tg.path.leg_phases(state.phase) > 0
+        np.testing.assert_array_equal(state.lift[swing], before.lift[swing])
+        assert (state.lift[~swing] == state.lift[~swing][0]).all()
+        before = state
+
+
+def test_a_command_to_stand_freezes_the_phase(subject):
+    core = subject.core
+    walking = walk(core, 40, action=np.zeros(14))[-1][0]
+    standing = walk(core, 40, command=STAND, state=walking, action=np.zeros(14))
+    assert all(state.phase == walking.phase for state, _ in standing)
+    last, desired = standing[-1]
+    assert last.gate == 0.0 and not last.stride.any()
+    np.testing.assert_allclose(last.targets[0], core.base_foot.reshape(-1), atol=1e-9)
+    np.testing.assert_allclose(desired, core.standing_target, atol=1e-9)
+    # And it goes on where it stopped.
+    again = walk(core, 1, state=last, action=np.zeros(14))[0][0]
+    advance = 2 * np.pi * core.config.base_frequency * core.dt
+    assert again.phase == pytest.approx(tg.path.wrap(walking.phase + advance))
+
+
+def test_motion_fades_in_over_the_start_time(subject):
+    core = subject.core
+    states = [state for state, _ in walk(core, 20, command=np.array([1.0, 0]), action=np.zeros(14))]
+    steps = round(core.config.start_time / core.dt)
+    expected = np.minimum(np.arange(1, 21) / steps, 1.0)
+    np.testing.assert_allclose([state.gate for state in states], expected)
+    np.testing.assert_allclose([state.stride[0] for state in states], expected)
+
+
+@pytest.mark.parametrize("tilt", [0.0, 0.2])
+def test_feet_follow_the_path_in_the_horizontal_frame(subject, tilt):
+    """LF in mid-swing is H above its base, RF in mid-stance is at it; a quarter later they are ±L/4·... apart."""
+    core = subject.make(np.float64, levelling=1.0)
+    quaternion = np.array([math.cos(tilt / 2), math.sin(tilt / 2) * 0.6, math.sin(tilt / 2) * 0.8, 0])
+    sensors = level_sensors(core)._replace(orientation=quaternion)
+    lift, length = np.full(4, 0.08), core.config.step_length
+    level = tg.frames.heading_from_trunk(tg.frames.up_in_trunk(quaternion))
+    for phase, rise, along in [
+        (np.pi / 2, 0.08, 0.0),
+        (np.pi / 4, 0.04, -0.34375),  # S(1/4) - ½ = 3/16 - 2/64 - ½
+        (3 * np.pi / 4, 0.04, 0.34375),
+    ]:
+        phases = tg.path.leg_phases(np.asarray(phase))
+        targets = core.foot_targets(phases, lift, LEFT, sensors) @ level.T - core.base_foot
+        for leg, up, forward in [(0, rise, along), (3, rise, along), (1, 0.0, -along), (2, 0.0, -along)]:
+            expected = [*(length * forward * LEFT), up]
+            np.testing.assert_allclose(targets[leg], expected, atol=1e-9)
+
+
+def test_levelling_scales_how_much_of_the_tilt_is_taken_out(subject):
+    quaternion = np.array([math.cos(0.1), 0, math.sin(0.1), 0])
+    phases, none = tg.path.leg_phases(np.asarray(0.5 * np.pi)), np.zeros(4)
+    targets = {}
+    for share in (0.0, 0.5, 1.0):
+        core = subject.make(np.float64, levelling=share)
+        sensors = level_sensors(core)._replace(orientation=quaternion)
+        targets[share] = core.foot_targets(phases, none, STAND, sensors)
+    np.testing.assert_allclose(targets[0.0], core.base_foot)
+    np.testing.assert_allclose(targets[0.5], (targets[0.0] + targets[1.0]) / 2)
+
+
+def test_residuals_add_to_the_angles_and_limits_hold(subject):
+    core = subject.make(np.float64, weight_compensation=0.0)
+    state, sensors = core.initial_state(np.asarray(0.5 * np.pi)), level_sensors(core)
+    _, plain = core.act(state, np.zeros(14), sensors, STAND)
+    residual = np.linspace(-1, 1, 12)
+    after, desired = core.act(state, np.concatenate([np.zeros(2), residual]), sensors, STAND)
+    np.testing.assert_allclose(desired - plain, core.config.residual_range * residual, atol=1e-12)
+    # The history of targets shows where the feet were really sent.
+    reached = tg.leg.forward(core.geometry, desired.reshape(4, 3))
+    np.testing.assert_allclose(after.targets[0].reshape(4, 3), reached, atol=1e-9)
+    for _, desired in walk(subject.make(np.float64, residual_range=5.0), 20):
+        assert (desired >= core.lower).all() and (desired <= core.upper).all()
+
+
+def test_load_is_shared_by_the_legs_in_stance():
+    quarter = np.full(4, 0.25)
+    np.testing.assert_allclose(load_share(tg.path.leg_phases(np.asarray(1.0)), np.asarray(0.0)), quarter)
+    swinging = load_share(tg.path.leg_phases(np.asarray(0.5 * np.pi)), np.asarray(1.0))
+    np.testing.assert_allclose(swinging, [0, 0.5, 0.5, 0])
+    for phase in np.linspace(-np.pi, np.pi, 50):
+        share = load_share(tg.path.leg_phases(np.asarray(phase)), np.asarray(1.0))
+        assert share.sum() == pytest.approx(1.0) and (share >= 0).all()
+    jump = [load_share(tg.path.leg_phases(np.asarray(p)), np.asarray(1.0)) for p in (-1e-6, 1e-6)]
+    np.testing.assert_allclose(*jump, atol=1e-5)
+
+
+def test_histories_are_newest_first(subject):
+    core = subject.core
+    (first, desired), (second, _) = walk(core, 2)
+    np.testing.assert_array_equal(second.actions[1], first.actions[0])
+    np.testing.assert_array_equal(second.targets[1], first.targets[0])
+    np.testing.assert_array_equal(first.desired, desired)
+    # The oldest entries came from the start: no action, feet at their base.
+    np.testing.assert_array_equal(first.actions[1], 0.0)
+    np.testing.assert_allclose(first.targets[1], core.base_foot.reshape(-1))
+
+
+def test_fixed_height_moves_the_feet_up_and_down_only(subject):
+    core = subject.make(np.float64, method="fixed_height")
+    for action in (np.zeros(14), np.array([0, 1.0, *np.zeros(12)])):
+        for state, _ in walk(core, 60, action=action):
+            moved = state.targets[0].reshape(4, 3) - core.base_foot
+            np.testing.assert_allclose(moved[:, :2], 0.0, atol=1e-9)
+            np.testing.assert_allclose(state.lift, core.config.lift)
+            up = state.gate * core.config.lift * tg.path.height(tg.path.leg_phases(state.phase))
+            np.testing.assert_allclose(moved[:, 2], up, atol=1e-9)
+    faster, _ = core.act(state, np.array([1.0, *np.zeros(13)]), level_sensors(core), LEFT)
+    assert faster.frequency > core.config.base_frequency  # this the policy may still choose
+
+
+# Observation --------------------------------------------------------------------------------------------------
+
+
+def parts(core, observation):
+    """The observation's parts by name."""
+    ends = np.cumsum([size for _, size in core.layout])
+    return {name: observation[end - size : end] for (name, size), end in zip(core.layout, ends, strict=True)}
+
+
+def test_feet_are_mujocos(subject):
+    """Feet in the heading frame, from the trunk's centre: sites turned by the trunk's rotation less its yaw."""
+    sensors = random_sensors(subject.core, 3)
+    data = subject.place(sensors.joint_position, sensors.orientation)
+    yaw = tg.frames.yaw(sensors.orientation)
+    world = data.site_xpos[subject.robot.foot_site_ids] - data.qpos[:3]
+    expected = np.concatenate([tg.frames.turn(-yaw, world[:, :2]), world[:, 2:]], axis=-1)
+    np.testing.assert_allclose(subject.core.feet(sensors), expected, atol=1e-7)
+
+
+def test_sample_points_lie_round_the_feet(subject):
+    core = subject.core
+    feet = core.feet(random_sensors(core, 3))
+    points = core.sample_points(feet)
+    assert points.shape == (4, 25, 2)
+    distance = np.linalg.norm(points - feet[:, None, :2], axis=-1)
+    np.testing.assert_allclose(np.sort(distance, axis=1), np.tile([0] + 6 * [0.03] + 8 * [0.06] + 10 * [0.1], (4, 1)), atol=1e-7)  # fmt: skip
+
+
+def test_observation_by_parts(subject):
+    core = subject.core
+    sensors, state = random_sensors(core, 1), walk(core, 7)[-1][0]
+    feet = core.feet(sensors)
+    heights = np.full((4, 25), -0.3)
+    heights[:, 5], heights[:, 6] = -1.0, 0.5
+    observation = core.observe(state, sensors, heights, LEFT)
+    assert observation.shape == (core.observation_size,) == (187,)
+    seen = parts(core, observation)
+    np.testing.assert_allclose(seen["command"], LEFT)
+    np.testing.assert_allclose(seen["up"], tg.frames.rotation(sensors.orientation)[2])
+    np.testing.assert_allclose(seen["angular_velocity"], 0.25 * sensors.angular_velocity)
+    np.testing.assert_allclose(seen["joint_position"], sensors.joint_position - core.default_pose)
+    np.testing.assert_allclose(seen["joint_velocity"], 0.1 * sensors.joint_velocity)
+    np.testing.assert_allclose(seen["frequency"], state.frequency - core.config.base_frequency)
+    np.testing.assert_allclose(seen["phase"], [math.sin(state.phase), math.cos(state.phase)])
+    np.testing.assert_allclose(seen["actions"], state.actions.reshape(-1))
+    targets = state.targets.reshape(2, 4, 3) - core.base_foot
+    np.testing.assert_allclose(seen["targets"], 10 * targets.reshape(-1), atol=1e-12)
+    # z = f - h: positive where the ground lies below the foot; a hole deeper than 25 cm is 25 cm deep.
+    below = seen["heights"].reshape(4, 25)
+    np.testing.assert_allclose(below[:, 0], 5 * (feet[:, 2] + 0.3))
+    np.testing.assert_allclose(below[:, 5], 5 * 0.25)
+    np.testing.assert_allclose(below[:, 6], -5 * 0.25)
+
+
+def test_blind_sees_the_same_without_heights(subject):
+    core, blind = subject.core, subject.make(np.float64, method="blind")
+    assert blind.observation_size == core.observation_size - 100
+    sensors, state = random_sensors(core, 1), walk(core, 3)[-1][0]
+    seeing = core.observe(state, sensors, np.zeros((4, 25)), LEFT)
+    np.testing.assert_array_equal(blind.observe(state, sensors, None, LEFT), seeing[:-100])
+
+
+@pytest.mark.parametrize("angle", [0.4, -1.3, 3.0])
+def test_absolute_yaw_is_neither_seen_nor_acted_on(subject, angle):
+    core = subject.core
+    sensors, state = random_sensors(core, 1), walk(core, 7)[-1][0]
+    turned = np.zeros(4)
+    mujoco.mju_mulQuat(
+        turned, np.array([math.cos(angle / 2), 0, 0, math.sin(angle / 2)]), sensors.orientation
+    )
+    heights = np.random.default_rng(0).uniform(-0.4, -0.2, (4, 25))
+    views = [
+        (
+            core.observe(state, seen, heights, LEFT),
+            core.feet(seen),
+            core.act(state, np.full(14, 0.3), seen, LEFT)[1],
+        )
+        for seen in (sensors, sensors._replace(orientation=turned))
+    ]
+    for one, other in zip(*views, strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-9)
+
+
+# Mirror symmetry ----------------------------------------------------------------------------------------------
+
+
+def mirror_joints(q):
+    """Joint angles (..., 12) of the mirror image in the x-z plane: sides swapped, abduction turned round."""
+    legs = np.reshape(q, (*np.shape(q)[:-1], 4, 3))[..., SWAP, :] * [-1, 1, 1]
+    return legs.reshape(np.shape(q))
+
+
+def mirror_sensors(sensors):
+    w, x, y, z = sensors.orientation
+    return tg.Sensors(
+        np.array([w, -x, y, -z]),
+        sensors.angular_velocity * [-1, 1, -1],
+        mirror_joints(sensors.joint_position),
+        mirror_joints(sensors.joint_velocity),
+    )
+
+
+def mirror_state(state):
+    """What the controller would remember had everything happened in the mirror."""
+    actions = state.actions.copy()
+    actions[:, 2:] = mirror_joints(actions[:, 2:])
+    targets = (state.targets.reshape(2, 4, 3)[:, SWAP] * [1, -1, 1]).reshape(2, 12)
+    return state._replace(
+        phase=tg.path.wrap(state.phase + np.pi),
+        lift=state.lift[SWAP],
+        stride=state.stride * [1, -1],
+        mirror=-state.mirror,
+        actions=actions,
+        targets=targets,
+        desired=mirror_joints(state.desired),
+    )
+
+
+def test_the_mirrored_robot_is_the_models_own(subject):
+    """The mirror of joint angles that is used here puts MuJoCo's feet at mirrored places."""
+    q = random_sensors(subject.core, 5).joint_position
+    feet = subject.place(q).site_xpos[subject.robot.foot_site_ids].copy()
+    mirrored = subject.place(mirror_joints(q)).site_xpos[subject.robot.foot_site_ids]
+    np.testing.assert_allclose(mirrored, feet[SWAP] * [1, -1, 1], atol=1e-9)
+
+
+@pytest.mark.parametrize("steps", [0, 1, 9, 24])
+def test_the_mirror_image_looks_the_same_and_is_moved_likewise(subject, steps):
+    core = subject.core
+    state = walk(core, steps)[-1][0] if steps else core.initial_state(np.asarray(0.5 * np.pi))
+    sensors = random_sensors(core, steps)
+    heights = np.random.default_rng(steps).uniform(-0.4, -0.2, (4, 25))
+    mirrored_heights = heights[SWAP][:, tg.samples.mirrored_points()]
+    RIGHT = LEFT * [1, -1]
+    image, image_sensors = mirror_state(state), mirror_sensors(sensors)
+    np.testing.assert_allclose(
+        core.observe(image, image_sensors, mirrored_heights, RIGHT),
+        core.observe(state, sensors, heights, LEFT),
+        atol=1e-9,
+    )
+    action = np.random.default_rng(steps).uniform(-1, 1, 14)
+    after, desired = core.act(state, action, sensors, LEFT)
+    image_after, image_desired = core.act(image, action, image_sensors, RIGHT)
+    np.testing.assert_allclose(image_desired, mirror_joints(desired), atol=1e-9)
+    for name, one, other in zip(after._fields, image_after, mirror_state(after), strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-9, err_msg=name)
+
+
+def test_mirror_has_hysteresis(subject):
+    core = subject.core
+    edge = core.config.mirror_hysteresis
+    mirror = np.asarray(1.0)
+    for lateral, expected in [(-0.9 * edge, 1), (-1.1 * edge, -1), (0.9 * edge, -1), (1.1 * edge, 1), (0, 1)]:
+        command = np.array([math.sqrt(1 - lateral**2), lateral])
+        mirror = core.update_mirror(mirror, command)
+        assert mirror == expected
+    assert subject.make(np.float64, mirror=False).update_mirror(np.asarray(1.0), np.array([0.0, -1.0])) == 1.0
+
+
+def test_mirroring_twice_changes_nothing(subject):
+    core = subject.core
+    index, sign = core._observation_mirror
+    np.testing.assert_array_equal(np.arange(187)[index][index], np.arange(187))
+    np.testing.assert_array_equal(sign * sign[index], 1.0)
+    action = np.random.default_rng(0).uniform(-1, 1, 14)
+    once = core.mirror_action(np.asarray(-1.0), action)
+    assert (once[:2] == action[:2]).all() and (once != action).any()
+    np.testing.assert_array_equal(core.mirror_action(np.asarray(-1.0), once), action)
+    np.testing.assert_array_equal(core.mirror_action(np.asarray(1.0), action), action)
+
+
+# NumPy and JAX ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", sorted(SUBJECTS))
+def test_numpy_and_jax_give_the_same_numbers(name):
+    """Single precision, thirty steps of which each goes on from NumPy's state."""
+    core = SUBJECTS[name].make(np.float32)
+    observe, act = jax.jit(core.observe), jax.jit(core.act)
+    rng = np.random.default_rng(0)
+    state = core.initial_state(np.asarray(0.5 * np.pi, np.float32))
+    for step in range(30):
+        sensors = random_sensors(core, step, np.float32)
+        heights = rng.uniform(-0.5, 0.0, (4, 25)).astype(np.float32)
+        angle = 0.6 * step
+        command = np.array([math.cos(angle), math.sin(angle)], np.float32) * np.float32(step % 7 != 0)
+        action = rng.uniform(-1, 1, 14).astype(np.float32)
+        on_device = jax.tree.map(jnp.asarray, (state, sensors, heights, command))
+        seen = core.observe(state, sensors, heights, command)
+        assert seen.dtype == np.float32
+        np.testing.assert_allclose(observe(*on_device), seen, atol=1e-6)
+        after, desired = core.act(state, action, sensors, command)
+        there, wanted = act(on_device[0], jnp.asarray(action), *on_device[1:2], on_device[3])
+        assert desired.dtype == np.float32
+        np.testing.assert_allclose(wanted, desired, atol=1e-6)
+        for field, one, other in zip(after._fields, after, there, strict=True):
+            assert np.asarray(one).dtype == np.float32, field
+            np.testing.assert_allclose(other, one, atol=1e-6, err_msg=field)
+        state = after
+
+
+def test_act_changes_nothing_it_was_given(subject):
+    core = subject.core
+    state, sensors, action = walk(core, 2)[-1][0], random_sensors(core, 0), np.full(14, 1.5)
+    copies = jax.tree.map(np.copy, (state, sensors, action))
+    core.act(state, action, sensors, LEFT)
+    core.observe(state, sensors, np.zeros((4, 25)), LEFT)
+    jax.tree.map(np.testing.assert_array_equal, (state, sensors, action), copies)
+
+
+def test_core_is_frozen(subject):
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        subject.core.dt = 0.01
