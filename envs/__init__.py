@@ -1,7 +1,7 @@
 """The quadruped environment on MJX."""
 
 from envs.auto_reset import AutoReset
-from envs.config import METHODS, CurriculumConfig, EnvConfig, RandomisationConfig
+from envs.config import EVALUATION_ITERATIONS, METHODS, CurriculumConfig, EnvConfig, RandomisationConfig
 from envs.env import GOAL, QuadrupedEnv
 from envs.robot import ROBOTS, RobotConfig
 from envs.types import Episode, Randomised
@@ -13,6 +13,7 @@ def make(config: EnvConfig) -> QuadrupedEnv:
 
 
 __all__ = [
+    "EVALUATION_ITERATIONS",
     "GOAL",
     "METHODS",
     "ROBOTS",

@@ -7,6 +7,9 @@ from rewards import RewardConfig
 from terrains import TerrainConfig
 from tg import TGConfig
 
+EVALUATION_ITERATIONS = 4
+"""Newton iterations with which the solver has converged on this robot."""
+
 METHODS = ("ours", "fixed_height", "blind")
 """The paper's method and its two baselines."""
 
@@ -87,6 +90,9 @@ class EnvConfig:
     """Control period (s): the policy runs at 50 Hz."""
     physics_dt: float = 0.005
     """Physics timestep (s)."""
+    solver_iterations: int = 2
+    """Newton iterations of the constraint solver. With one, a robot on blocks falls where it would not
+    (docs/physics.md); evaluation takes `EVALUATION_ITERATIONS`."""
     num_planes: int = 1
     """Terrain surfaces a foot can touch at once: 1, or 2 (tread and riser)."""
     episode_time: float = 10.0

@@ -159,7 +159,8 @@ class QuadrupedEnv(Env):
         after = after.replace(controller=controller, step=before.step + 1)
         below, around = self._terrain_at_feet(after)
         after = after.replace(
-            progress=jnp.maximum(before.progress, (after.qpos[:2] - after.origin) @ after.command),
+            # fmax: where the physics exploded, what was reached before stays.
+            progress=jnp.fmax(before.progress, (after.qpos[:2] - after.origin) @ after.command),
             lift_off=jnp.where(tg.path.leg_phases(controller.phase) > 0, before.lift_off, around[:, 0]),
         )
         terms = self._reward_terms(before, after, below, around)
@@ -311,7 +312,8 @@ class QuadrupedEnv(Env):
         contact = functools.partial(
             terrains.contact, self.bank, episode.terrain, floor=episode.floor, num_planes=c.num_planes
         )
-        key, key_push = jax.random.split(episode.key)
+        # Not `split`: its second key is fold_in(key, 1), which is the sensors' noise.
+        key, key_push = jax.random.fold_in(episode.key, 0), jax.random.fold_in(episode.key, 4)
         data = self._data.replace(
             qpos=episode.qpos, qvel=episode.qvel + self._push(key_push), qacc_warmstart=episode.warmstart
         )
@@ -330,6 +332,7 @@ class QuadrupedEnv(Env):
                 self.robot.foot_geom_ids,
                 contact,
                 jnp.concatenate([jnp.zeros(6), torque]),
+                c.solver_iterations,
             )
             return (now.qpos, now.qvel, now.qacc_warmstart, torque), None
 
@@ -442,6 +445,8 @@ def check(config: EnvConfig) -> None:
         raise ValueError(
             f"control_dt={config.control_dt} must be a whole multiple of physics_dt={config.physics_dt}"
         )
+    if config.solver_iterations < 1:
+        raise ValueError(f"solver_iterations={config.solver_iterations} must be at least 1")
     if len(config.curriculum.difficulty) != len(config.curriculum.depth) or not config.curriculum.depth:
         raise ValueError(
             "curriculum.difficulty and curriculum.depth must have the same number of levels, at least 1"

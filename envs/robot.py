@@ -230,7 +230,7 @@ def _set_training_physics(spec: mujoco.MjSpec) -> None:
     option.solver = mujoco.mjtSolver.mjSOL_NEWTON
     option.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
     option.iterations = 1
-    option.ls_iterations = 5
+    option.ls_iterations = 3
     option.impratio = 1.0
     option.disableflags |= mujoco.mjtDisableBit.mjDSBL_EULERDAMP
 

@@ -6,8 +6,7 @@ import jax
 from tg import ControllerState
 
 
-@flax.struct.dataclass
-class Randomised:
+class Randomised(flax.struct.PyTreeNode):
     """Parameters drawn once an episode."""
 
     friction: jax.Array
@@ -24,8 +23,7 @@ class Randomised:
     """(3,) m, error of the perceived map."""
 
 
-@flax.struct.dataclass
-class Episode:
+class Episode(flax.struct.PyTreeNode):
     """Everything that belongs to an episode: a reset replaces all of it."""
 
     qpos: jax.Array

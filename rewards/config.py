@@ -19,7 +19,7 @@ class RewardConfig:
     """Weight of r_smooth."""
     energy: float = 0.0005
     """Weight of r_tau (1/W)."""
-    terrain: float = 0.3
+    terrain: float = 1.0
     """Weight of r_terrain (mean over the feet)."""
     height: float = 1.0
     """Weight of r_height (1/m, mean over the feet)."""

@@ -53,6 +53,7 @@ def evaluation_config(
         spawn_yaw=0.0,
         spawn_offset=0.0,
         end_in_gap=False,
+        solver_iterations=max(config.solver_iterations, envs.EVALUATION_ITERATIONS),
     )
 
 

@@ -46,11 +46,12 @@ class Checkpoints:
         target = _leaves(like)
         for step in reversed(self.steps()):
             about = self._about(step)
-            if about is not None and about["layout"] != _layout(target):
-                raise ValueError(_difference(self.folder / str(step), about["layout"], _layout(target)))
-            leaves = None if about is None else self._read(step, jax.tree.map(_abstract, target))
-            if leaves is not None and _digest(leaves) in ("", about["digest"]):
-                return _unflatten(like, leaves), about
+            if about is not None:
+                if about["layout"] != _layout(target):
+                    raise ValueError(_difference(self.folder / str(step), about["layout"], _layout(target)))
+                leaves = self._read(step, jax.tree.map(_abstract, target))
+                if leaves is not None and _digest(leaves) in ("", about["digest"]):
+                    return _unflatten(like, leaves), about
             aside = self.folder / f"damaged-{step}"
             print(
                 f"checkpoint {self.folder / str(step)} is damaged; skipped, and renamed to {aside.name}",
@@ -62,7 +63,9 @@ class Checkpoints:
 
     def _about(self, step: int) -> dict[str, Any] | None:
         try:
-            about = self._manager.restore(step, args=ocp.args.Composite(about=ocp.args.JsonRestore()))["about"]
+            about = self._manager.restore(step, args=ocp.args.Composite(about=ocp.args.JsonRestore()))[
+                "about"
+            ]
             checksum = about.pop("checksum", "")
             return about if checksum in ("", _checksum(about)) else None
         except Exception:  # whatever a damaged file leads a reader to raise

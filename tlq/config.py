@@ -241,10 +241,10 @@ def _resumed(data: dict[str, Any], overrides: Sequence[str]) -> dict[str, Any]:
 def build(cls: Any, data: dict[str, Any]) -> Any:
     """Nested frozen dataclass from a nested dict; lists become tuples, so that configurations can be hashed."""
     hints = typing.get_type_hints(cls)
-    defaults = {f.name: f for f in dataclasses.fields(cls)}
-    unknown = [k for k in data if k not in defaults]
-    if unknown:
-        raise UsageError(unknown("setting", unknown[0], list(defaults)))
+    known = [f.name for f in dataclasses.fields(cls)]
+    for name in data:
+        if name not in known:
+            raise UsageError(unknown("setting", name, known))
     values = {}
     for name, value in data.items():
         kind = hints[name]

@@ -127,9 +127,15 @@ def describe(config: Any) -> dict[str, Any]:
             for (name, size), offset in zip(core.layout, offsets, strict=False)
         ],
         "memory": {"kind": config.policy.memory, "size": _memory_size(config.policy)},
-        "training": dataclasses.asdict(config),
+        "training": _settings(config),
         "commit": _commit(),
     }
+
+
+def _settings(config: Any) -> dict[str, Any]:
+    """The training's settings, without those that say where on a machine it ran."""
+    settings = dataclasses.asdict(config)
+    return {k: v for k, v in settings.items() if k not in ("run", "resume", "init", "devices", "cache")}
 
 
 @functools.lru_cache(maxsize=4)

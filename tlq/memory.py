@@ -134,7 +134,7 @@ class Memory(nn.Module):
         step = x.ndim == 2
         if step:
             x, is_first = x[None], is_first[None]
-        block = {"mingru": MinGRU, "gru": GRU}[self.kind]
+        block: Any = {"mingru": MinGRU, "gru": GRU}[self.kind]
         carries = []
         for i, h in enumerate(jnp.split(carry, self.layers, axis=-1)):
             h, x = block(self.width, name=f"layer_{i}")(h, x, is_first)

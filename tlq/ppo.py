@@ -103,7 +103,8 @@ def hoist(function: Callable[..., Any], *example: Any) -> tuple[list[Any], Calla
     structure = jax.tree.structure(shape)
 
     def pure(constants: list[Any], *arguments: Any) -> Any:
-        return structure.unflatten(jax.core.eval_jaxpr(closed.jaxpr, constants, *jax.tree.leaves(arguments)))
+        results = jax.core.eval_jaxpr(closed.jaxpr, constants, *jax.tree.leaves(arguments))
+        return jax.tree.unflatten(structure, results)
 
     return closed.consts, pure
 
@@ -147,7 +148,8 @@ class Learner:
             clipping_epsilon=config.clip,
             vf_coefficient=config.value_loss,
         )
-        self.specs = TrainState(P(), P(), P(), P(), P(AXIS), P(), P())
+        specs: list[Any] = [P(), P(), P(), P(), P(AXIS), P(), P()]  # only the environments are split
+        self.specs = TrainState(*specs)
         self._hoist()
         # Nothing is donated: the state before an update stays whole, so that a failed one can be saved and replayed.
         # That costs one env_state; the rollout, which is ten times larger, lives inside the call.

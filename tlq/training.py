@@ -4,6 +4,7 @@ run/config.yaml  metrics.csv  events.*  curve.png  policy.npz  checkpoints/  fai
 """
 
 import contextlib
+import dataclasses
 import signal
 import time
 from collections.abc import Iterator
@@ -11,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from brax.envs.base import Env
 from brax.envs.wrappers.training import VmapWrapper
@@ -55,6 +57,8 @@ def train(config: TrainConfig, env: Env | None = None, heights: int | None = Non
     state = learner.init(config.seed)
     if config.init and not config.resume:
         state = initialise(state, config.init)
+        if not int(state.normaliser.count.lo):
+            state = measure_rest(learner, state)
     folder.mkdir(parents=True, exist_ok=True)
     checkpoints = Checkpoints(folder / "checkpoints", config.keep)
     if config.resume:
@@ -142,7 +146,7 @@ def save_failed(config: TrainConfig, before: TrainState, iteration: int) -> str:
 
 
 def initialise(state: TrainState, source: str) -> TrainState:
-    """Parameters and normaliser from another run's folder or from an exported policy (which has no critic)."""
+    """Parameters and normaliser from another run's folder or from a policy file (which has nothing for the critic)."""
     path = Path(source)
     if path.is_dir():
         arrays = read_arrays(path / "checkpoints" if (path / "checkpoints").is_dir() else path)
@@ -165,7 +169,28 @@ def initialise(state: TrainState, source: str) -> TrainState:
     flat = [take(n, x) for n, x in zip(names(parts), jax.tree.leaves(parts), strict=True)]
     parts = jax.tree.unflatten(jax.tree.structure(parts), flat)
     print(f"init: {len(taken)} of {len(flat)} arrays from {source}", flush=True)
-    return state.replace(params=parts["params"], normaliser=parts["normaliser"])
+    return dataclasses.replace(state, params=parts["params"], normaliser=parts["normaliser"])
+
+
+def measure_rest(learner: Learner, state: TrainState) -> TrainState:
+    """Normaliser of a policy file completed by what one iteration, which only looks, measures for the critic.
+
+    It then counts as if seen for a hundred iterations, so that the policy's part of it stays nearly what it was.
+    """
+    looked, _ = learner.step(state)
+    given, measured = state.normaliser, looked.normaliser
+    count = 100 * int(measured.count.lo)
+    chosen = {k: given if k == "state" else measured for k in measured.mean}
+    std = {k: n.std[k] for k, n in chosen.items()}
+    normaliser = measured.replace(
+        mean={k: n.mean[k] for k, n in chosen.items()},
+        std=std,
+        summed_variance={k: count * jnp.square(x) for k, x in std.items()},
+        count=dataclasses.replace(
+            measured.count, lo=jax.device_put(np.uint32(count), measured.count.lo.sharding)
+        ),
+    )
+    return dataclasses.replace(looked, normaliser=normaliser, iteration=state.iteration)
 
 
 def check_folder(config: TrainConfig) -> Path:
