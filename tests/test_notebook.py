@@ -24,7 +24,8 @@ def test_notebook_holds_no_results():
 
 
 @pytest.mark.slow
-def test_notebook_runs(tmp_path):
+def test_notebook_runs(tmp_path, monkeypatch):
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))  # the kernel's, where tlq isn't installed
     notebook = nbformat.read(NOTEBOOK, as_version=4)
     (parameters,) = [cell for cell in notebook.cells if "parameters" in cell.metadata.get("tags", [])]
     parameters.source += f"\npolicy_name = {str(shipped_policy(tmp_path))!r}\nseconds = 0.2"

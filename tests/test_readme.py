@@ -1,6 +1,6 @@
 """What the documents say can be done, can: commands parse, links and paths lead somewhere, code runs."""
 
-import importlib
+import importlib.util
 import re
 import shlex
 import tomllib
@@ -15,7 +15,7 @@ ROOT = Path(__file__).resolve().parents[1]
 DOCUMENTS = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md")])
 README = (ROOT / "README.md").read_text()
 
-COMMAND = re.compile(r"python (train\.py|-m tlq\.\w+)((?: +[\w.]+=[^\s`|]+)*)")
+COMMAND = re.compile(r"python (train\.py|-m (?:tlq|benchmarks)\.\w+)((?: +[\w.]+=[^\s`|]+)*)")
 SETTING = re.compile(r"`((?:env|policy|ppo)(?:\.\w+)+)=([^`\s]*)`")
 LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
 PLACE = re.compile(
@@ -44,6 +44,8 @@ def test_commands_have_settings_that_exist(program, arguments):
     arguments = shlex.split(arguments)
     if program == "train.py":
         train_arguments(arguments)
+    elif program.startswith("-m benchmarks."):
+        assert importlib.util.find_spec(program.split()[1])
     else:
         module = importlib.import_module(program.split()[1])
         cli.parse(module.Options, arguments)

@@ -10,14 +10,13 @@ import numpy as np
 import pytest
 
 import tg
+from tests.tg.mirror import SWAP, mirror_joints, mirror_sensors, mirror_state
 from tests.tg.robots import SUBJECTS
 from tg.core import load_share
 
 LEFT = np.array([math.cos(0.7), math.sin(0.7)])
 """A command to the front left."""
 STAND = np.zeros(2)
-SWAP = [1, 0, 3, 2]
-"""The legs' mirror images: LF <-> RF, LR <-> RR."""
 
 
 def random_sensors(core, seed, dtype=np.float64):
@@ -210,7 +209,8 @@ def test_sample_points_lie_round_the_feet(subject):
     points = core.sample_points(feet)
     assert points.shape == (4, 25, 2)
     distance = np.linalg.norm(points - feet[:, None, :2], axis=-1)
-    np.testing.assert_allclose(np.sort(distance, axis=1), np.tile([0] + 6 * [0.03] + 8 * [0.06] + 10 * [0.1], (4, 1)), atol=1e-7)  # fmt: skip
+    radii = np.repeat([0.0, 0.03, 0.06, 0.10], [1, 6, 8, 10])
+    np.testing.assert_allclose(np.sort(distance, axis=1), np.tile(radii, (4, 1)), atol=1e-7)
 
 
 def test_observation_by_parts(subject):
@@ -269,38 +269,6 @@ def test_absolute_yaw_is_neither_seen_nor_acted_on(subject, angle):
 
 
 # Mirror symmetry ----------------------------------------------------------------------------------------------
-
-
-def mirror_joints(q):
-    """Joint angles (..., 12) of the mirror image in the x-z plane: sides swapped, abduction turned round."""
-    legs = np.reshape(q, (*np.shape(q)[:-1], 4, 3))[..., SWAP, :] * [-1, 1, 1]
-    return legs.reshape(np.shape(q))
-
-
-def mirror_sensors(sensors):
-    w, x, y, z = sensors.orientation
-    return tg.Sensors(
-        np.array([w, -x, y, -z]),
-        sensors.angular_velocity * [-1, 1, -1],
-        mirror_joints(sensors.joint_position),
-        mirror_joints(sensors.joint_velocity),
-    )
-
-
-def mirror_state(state):
-    """What the controller would remember had everything happened in the mirror."""
-    actions = state.actions.copy()
-    actions[:, 2:] = mirror_joints(actions[:, 2:])
-    targets = (state.targets.reshape(2, 4, 3)[:, SWAP] * [1, -1, 1]).reshape(2, 12)
-    return state._replace(
-        phase=tg.path.wrap(state.phase + np.pi),
-        lift=state.lift[SWAP],
-        stride=state.stride * [1, -1],
-        mirror=-state.mirror,
-        actions=actions,
-        targets=targets,
-        desired=mirror_joints(state.desired),
-    )
 
 
 def test_the_mirrored_robot_is_the_models_own(subject):

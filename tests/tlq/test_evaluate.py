@@ -13,7 +13,6 @@ import pytest
 
 import envs
 import terrains
-import tg
 from tests.tlq.policies import trained
 from tlq import cli, evaluate, judge
 from tlq.cli import UsageError, parse
@@ -192,8 +191,7 @@ def test_mujoco_walks_and_writes_what_it_found(file, tmp_path, capsys):
     found = json.loads(out.read_text())
     assert found["terrain"] == "flat" and found["engine"] == "mujoco" and found["difficulty"] == 0.8
     assert found["episodes"] == 2 and found["seed"] == 3 and found["policy"] == str(file)
-    assert found["distance_m"]["mean"] > 0.3  # the generator alone walks
-    assert 0.02 < found["swing_height_m"] < 0.14 and 20 < found["energy_j_per_m"] < 1000
+    assert sum(found["ended_by"].values()) == 2 and 0.02 < found["swing_height_m"] < 0.14
     printed = capsys.readouterr().out
     assert "episode 0: " in printed and "success" in printed
     assert os.listdir(tmp_path) == ["result.json"]
@@ -265,43 +263,33 @@ def test_mjx_walks_and_counts_the_same_things(file):
 
 
 @pytest.mark.slow
-def test_engines_start_alike(tmp_path):
-    """One policy, one terrain, both engines: the stand, what is observed there, and the first 0.3 s."""
+def test_engines_are_the_same_at_the_same_settings(tmp_path):
+    """With MJX's timestep and its one Newton iteration, MuJoCo C walks the same steps; so does all around it."""
     from tlq import batch
     from tlq.runtime import load_policy
 
     file = trained(spread=0.02).export(tmp_path / "policy.npz")
     controller, direction = Controller(file), evaluate.direction(1)
     config, policy = evaluate.training_env(controller.metadata), load_policy(file)
-    sizes = terrains.TerrainConfig(kind="blocks", num_terrains=2, seed=evaluate.FIRST_SEED)
+    sizes = terrains.TerrainConfig(kind="flat", num_terrains=2, seed=evaluate.FIRST_SEED)
     env = envs.make(batch.evaluation_config(config, sizes, 0.8, noise=False))
-    terrain = terrains.make_terrain("blocks", "paper", evaluate.FIRST_SEED, index=1)
-    simulation = Simulation(controller, terrain, config)
+    simulation = Simulation(controller, terrains.make_terrain("flat", "paper", 0), config, timestep=0.005)
+    simulation.model.opt.iterations = env.mj_model.opt.iterations
+    simulation.model.opt.ls_iterations = env.mj_model.opt.ls_iterations
 
     key, towards = jax.random.PRNGKey(0), jnp.asarray(direction, jnp.float32)
     state = jax.jit(lambda: batch._begin(env, key, jnp.int32(1), towards, jnp.float32(0.5 * np.pi)))()
-    qpos = np.asarray(state.pipeline_state.qpos)
-    np.testing.assert_allclose(simulation.data.qpos, qpos, atol=1e-6)
-    with np.load(file) as arrays:
-        assert arrays["normaliser.mean.state"].shape == env.observe(state.pipeline_state)["state"].shape
-    tally = judge.begin(batch._moment(env, state.pipeline_state))
-    memory = jnp.zeros(policy.memory_size)
+    tally, memory = judge.begin(batch._moment(env, state.pipeline_state)), jnp.zeros(policy.memory_size)
+    here = judge.begin(simulation.moment())
     step = jax.jit(lambda *carry: batch._step(policy, env, *carry))
-    for number in range(15):
-        observed = np.asarray(env.observe(state.pipeline_state)["state"])
-        seen = controller.core.observe(
-            controller.state,
-            tg.Sensors(*(np.asarray(x, np.float32) for x in simulation._sensors.values())),
-            simulation._heights.astype(np.float32),
-            np.asarray(tg.frames.turn(np.asarray(-simulation.yaw), direction), np.float32),
-        )
-        if number == 0:  # a height near an edge may be that of either side: the heightfield has cells of 2 cm
-            assert np.mean(np.abs(seen - observed) < 1e-3) > 0.95
-            np.testing.assert_allclose(seen[:-100], observed[:-100], atol=1e-3)
+    for _ in range(15):
         state, memory, tally = step(state, memory, tally)
-        simulation.step(direction)
-    np.testing.assert_allclose(simulation.data.qpos, state.pipeline_state.qpos, atol=0.04)
-    assert tally.ended == judge.RUNNING and tally.steps == 15
+        here = judge.update(here, simulation.step(direction), np.zeros(2), direction, DT)
+        np.testing.assert_allclose(simulation.data.qpos, state.pipeline_state.qpos, atol=2e-3)
+        np.testing.assert_allclose(controller.memory, memory, atol=2e-3)
+    # Work is summed over substeps here, and taken from the last one there.
+    for name, value in here._replace(work=tally.work)._asdict().items():
+        np.testing.assert_allclose(getattr(tally, name), value, atol=2e-3, err_msg=name)
 
 
 # -- command line ----------------------------------------------------------------------------------------------------

@@ -21,7 +21,7 @@ from tlq.config import TrainConfig, load_config
 from tlq.logger import Logger, read_csv, text_line
 from tlq.networks import NetworkConfig
 from tlq.ppo import PPOConfig
-from tlq.training import TrainingFailed, initialise, make_learner, train
+from tlq.training import TrainingFailed, initialise, make_learner, measure_rest, train
 
 ROOT = Path(__file__).parents[2]
 NETWORKS = NetworkConfig(
@@ -165,7 +165,12 @@ def test_a_run_can_start_from_another_ones_parameters(run, learner, tmp_path):
         if name.startswith(("params", "normaliser")):
             np.testing.assert_array_equal(x, arrays[name], err_msg=name)
     assert int(state.iteration) == 0
-    # From a policy file, which has neither critic nor the normaliser's counts.
+
+
+def test_a_run_can_start_from_a_policy_file(run, learner, tmp_path):
+    """It has neither critic nor the normaliser's part for it; what the policy sees stays as it was."""
+    run(3)
+    arrays = read_arrays(tmp_path / "run/checkpoints")
     kept = {
         n: x
         for n, x in arrays.items()
@@ -173,9 +178,20 @@ def test_a_run_can_start_from_another_ones_parameters(run, learner, tmp_path):
     }
     np.savez(tmp_path / "policy.npz", **kept)
     fresh = learner.init(7)
-    state = initialise(fresh, str(tmp_path / "policy.npz"))
+    state = measure_rest(learner, initialise(fresh, str(tmp_path / "policy.npz")))
     for name, x, y in zip(names(state), jax.tree.leaves(state), jax.tree.leaves(fresh), strict=True):
-        np.testing.assert_array_equal(x, arrays[name] if name in kept else y, err_msg=name)
+        if name.startswith("params"):
+            np.testing.assert_array_equal(x, arrays[name] if name in kept else y, err_msg=name)
+    np.testing.assert_array_equal(state.normaliser.mean["state"], arrays["normaliser.mean.state"])
+    assert int(state.iteration) == 0
+    after, _ = learner.step(state)
+    assert any(
+        (x != y).any() for x, y in zip(*map(jax.tree.leaves, (state.params, after.params)), strict=True)
+    )
+    np.testing.assert_allclose(
+        after.normaliser.std["state"], arrays["normaliser.std.state"], rtol=0.05, atol=0.02
+    )
+    np.testing.assert_allclose(after.normaliser.mean["privileged_state"][0], 0.0, atol=1.0)
 
 
 def test_parameters_of_other_sizes_are_refused(learner, tmp_path):
