@@ -20,7 +20,8 @@ import numpy as np
 from mujoco import mjx
 
 import terrains
-from envs import physics
+from envs import RobotConfig, physics
+from envs.robot import robot_spec
 
 RADIUS, MASS, FRICTION, GRAVITY = 0.025, 2.0, 0.8, 9.81
 TIMESTEP = 0.005
@@ -28,8 +29,8 @@ STEPS = 160
 KINDS = ("blocks", "stairs", "stepping_stones", "poles")
 STEP = 0.05
 """The edges that are looked for are at least this high (m)."""
-SETTINGS = ((1, 1), (2, 1), (1, 3), (2, 3), (1, 20), (2, 20))
-"""Planes a foot and Newton iterations that are compared; training uses the first by default."""
+SETTINGS = ((1, 1), (2, 1), (1, 2), (2, 2), (1, 4), (2, 4))
+"""Planes a foot and Newton iterations that are compared."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -144,16 +145,14 @@ def make_cases(where: dict[str, int], each: Sequence[terrains.Terrain], count: i
 # Two engines ----------------------------------------------------------------------------------------------------
 
 
-def foot_spec(iterations: int, ls_iterations: int) -> mujoco.MjSpec:
-    """The foot with the contact settings of the robot's feet."""
+def foot_spec() -> mujoco.MjSpec:
+    """The foot with the physics options of training and the contact settings of the robot's feet."""
     spec = mujoco.MjSpec()
-    option = spec.option
-    option.timestep = TIMESTEP
-    option.integrator = mujoco.mjtIntegrator.mjINT_EULER
-    option.solver = mujoco.mjtSolver.mjSOL_NEWTON
-    option.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
-    option.iterations, option.ls_iterations = iterations, ls_iterations
-    option.gravity = (0, 0, -GRAVITY)
+    training = robot_spec(RobotConfig()).option
+    for name in ("integrator", "solver", "cone", "impratio", "iterations", "ls_iterations", "disableflags"):
+        setattr(spec.option, name, getattr(training, name))
+    spec.option.timestep = TIMESTEP
+    spec.option.gravity = (0, 0, -GRAVITY)
     body = spec.worldbody.add_body(name="foot")
     for axis in np.eye(3):
         body.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=axis)
@@ -175,7 +174,7 @@ def simulate_mjx(
     bank: terrains.Bank, cases: Sequence[Case], num_planes: int, iterations: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Positions (N, T, 3) m and velocities (N, T, 3) m/s of N cases."""
-    spec = foot_spec(iterations, 5 if iterations == 1 else 20)
+    spec = foot_spec()
     physics.add_planes(spec, "foot", num_planes, FRICTION)
     host = spec.compile()
     model = mjx.put_model(host)
@@ -189,7 +188,7 @@ def simulate_mjx(
         )
 
         def step(data, _):
-            data = physics.substep(model, data, planes, feet, contact, force)
+            data = physics.substep(model, data, planes, feet, contact, force, iterations)
             return data, (data.qpos, data.qvel)
 
         return jax.lax.scan(step, empty.replace(qpos=position, qvel=velocity), length=STEPS)[1]
@@ -199,14 +198,12 @@ def simulate_mjx(
     return np.asarray(positions, np.float64), np.asarray(velocities, np.float64)
 
 
-def simulate_c(
-    each: Sequence[terrains.Terrain], cases: Sequence[Case], iterations: int = 100
-) -> tuple[np.ndarray, np.ndarray]:
+def simulate_c(each: Sequence[terrains.Terrain], cases: Sequence[Case]) -> tuple[np.ndarray, np.ndarray]:
     """The same by MuJoCo C on boxes, cylinders and a plane."""
     models = {}
     for k in {case.terrain for case in cases}:
-        spec = foot_spec(iterations, 50)
-        spec.option.tolerance = 1e-12
+        spec = foot_spec()
+        spec.option.iterations, spec.option.ls_iterations, spec.option.tolerance = 100, 50, 1e-12
         terrains.add_to_spec(spec, each[k])
         models[k] = spec.compile()
     runs = np.zeros((2, len(cases), STEPS, 3))

@@ -17,7 +17,6 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from mujoco import mjx
 
 import envs
 import terrains
@@ -37,14 +36,12 @@ def make_env(num_planes: int = 1, iterations: int = 1) -> envs.QuadrupedEnv:
         terrain=terrains.TerrainConfig(kind="flat", num_terrains=1, half_extent=2.0),
         randomisation=envs.RandomisationConfig(enabled=False),
         num_planes=num_planes,
+        solver_iterations=iterations,
         spawn_offset=0.0,
         spawn_yaw=0.0,
         stand_share=0.0,
     )
-    env = envs.make(config)
-    env.mj_model.opt.iterations = iterations
-    env._model = mjx.put_model(env.mj_model)
-    return env
+    return envs.make(config)
 
 
 def commands(count: int) -> np.ndarray:

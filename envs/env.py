@@ -121,7 +121,7 @@ class QuadrupedEnv(Env):
             [c.spawn_yaw, jnp.pi]
         )
         # At ±π/2 every foot is in the middle of its step: fading in the stride pushes the robot neither way.
-        phase = jnp.where(jax.random.bernoulli(next(keys)), 0.5, -0.5) * jnp.pi
+        phase = jnp.where(jax.random.bernoulli(next(keys)), 0.5, -0.5) * jnp.float32(jnp.pi)
         walk = jax.random.uniform(next(keys)) >= c.stand_share
         command = jnp.where(walk, jnp.stack([jnp.cos(angle), jnp.sin(angle)]), 0.0)
         ground = terrains.height(self.bank, terrain, xy)

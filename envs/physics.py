@@ -93,6 +93,19 @@ def substep(
       qfrc: (nv,) generalised force.
       iterations: Newton iterations of the constraint solver.
     """
+    with jax.default_matmul_precision("highest"):  # TF32, a GPU's default, ruins contact
+        return _substep(model, data, planes, feet, contact, qfrc, iterations)
+
+
+def _substep(
+    model: mjx.Model,
+    data: mjx.Data,
+    planes: np.ndarray,
+    feet: np.ndarray,
+    contact: Contact,
+    qfrc: jax.Array,
+    iterations: int,
+) -> mjx.Data:
     data = mjx.kinematics(model, data)
     _, normal, point = contact(data.geom_xpos[feet])
     ids = planes.reshape(-1)

@@ -1,5 +1,6 @@
 """What the documents say can be done, can: commands parse, links and paths lead somewhere, code runs."""
 
+import dataclasses
 import importlib.util
 import re
 import shlex
@@ -39,6 +40,13 @@ def train_arguments(arguments):
         config.from_hydra(compose("train", overrides=arguments), arguments)
 
 
+def filled_in(options, argument):
+    """NAME and the like stand for one of the choices."""
+    key, _, value = argument.partition("=")
+    choices = {field.name: field.metadata["choices"] for field in dataclasses.fields(options)}.get(key)
+    return f"{key}={choices()[0]}" if choices and value.isupper() else argument
+
+
 @pytest.mark.parametrize(("program", "arguments"), everywhere(COMMAND))
 def test_commands_have_settings_that_exist(program, arguments):
     arguments = shlex.split(arguments)
@@ -48,7 +56,7 @@ def test_commands_have_settings_that_exist(program, arguments):
         assert importlib.util.find_spec(program.split()[1])
     else:
         module = importlib.import_module(program.split()[1])
-        cli.parse(module.Options, arguments)
+        cli.parse(module.Options, [filled_in(module.Options, argument) for argument in arguments])
 
 
 @pytest.mark.parametrize(("key", "value"), everywhere(SETTING))

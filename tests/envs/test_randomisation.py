@@ -154,7 +154,7 @@ def in_the_air(subject, **randomised):
     rng = np.random.default_rng(4)
     env = subject.env
     qpos = standing(env, z=1.0, joints=env.robot.default_pose + rng.normal(0, 0.2, 12))
-    state = change(subject.state, qpos=qpos, qvel=rng.normal(0, 1.0, 18), terrain=0)
+    state = change(subject.state, qpos=qpos, qvel=rng.normal(0, 1.0, 18), terrain=0, floor=env.bank.floor[0])
     drawn = {"friction": 0.8, "payload": 0, "kp_factor": 1, "kd_factor": 1, "latency": 0} | randomised
     old = state.pipeline_state.randomised
     new = old.replace(**{k: jnp.asarray(v, getattr(old, k).dtype) for k, v in drawn.items()})
