@@ -268,7 +268,7 @@ def compare(
     # A foot that chatters between tread and riser rests, too; where it does is the mean.
     still = np.linalg.norm(v[:, -20:], axis=-1).max(axis=1) < 0.02
     still &= (np.linalg.norm(w[:, -20:], axis=-1).mean(axis=1) < 0.1) & within.all(axis=1)
-    ends = p[:, -1, 2] - q[:, -20:, 2].mean(axis=1)
+    ends = (p - q)[:, -20:, 2].mean(axis=1)
     ours, theirs = energy(cases, q, w), energy(cases, p, v)
 
     def rise(e):

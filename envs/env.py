@@ -294,7 +294,9 @@ class QuadrupedEnv(Env):
         )
         parts = [state, rest]
         if not self.core.heights:
-            parts.append(5.0 * jnp.clip(below[:, None] + true[:, :1] - true, -0.25, 0.25).reshape(-1))
+            seen = 5.0 * jnp.clip(below[:, None] + true[:, :1] - true, -0.25, 0.25)
+            mirrored = seen[order][:, jnp.array(tg.samples.mirrored_points())]
+            parts.append(jnp.where(mirror > 0, seen, mirrored).reshape(-1))
         return jnp.concatenate(parts)
 
     # -- physics

@@ -95,13 +95,14 @@ class SteppingStonesConfig(_Config):
 class PolesConfig(_Config):
     """Round poles on a square lattice that is shaken within the limits below, over a pit."""
 
-    diameter_min: Levels = (0.30, 0.10, 0.08)
+    diameter_min: Levels = (0.42, 0.10, 0.08)
     """Smallest diameter (m)."""
-    diameter_max: Levels = (0.30, 0.15, 0.08)
+    diameter_max: Levels = (0.42, 0.15, 0.08)
     """Largest diameter (m)."""
-    gap_min: Levels = (0.01, 0.05, 0.05)
-    """Smallest edge-to-edge gap to any neighbour (m)."""
-    gap_max: Levels = (0.03, 0.12, 0.12)
+    gap_min: Levels = (-0.12, 0.05, 0.05)
+    """Smallest edge-to-edge gap to any neighbour (m). Trivial poles overlap and leave no hole: standing apart by a
+    centimetre, round poles on a square lattice still leave a fifth of the ground open between four of them."""
+    gap_max: Levels = (-0.08, 0.12, 0.12)
     """Largest edge-to-edge gap to each of the four lattice neighbours (m)."""
     sweeps: int = 16
     """Rounds of random moves; 0 leaves a perfect lattice of equal poles."""

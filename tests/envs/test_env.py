@@ -465,9 +465,6 @@ def test_critic_and_policy_see_the_same_in_the_mirror(exact):
         np.testing.assert_allclose(one[name], other[name], atol=1e-4, err_msg=name)
 
 
-@pytest.mark.xfail(
-    strict=True, reason="the 100 heights that only the blind policy's critic sees aren't mirrored"
-)
 def test_the_blind_policys_critic_sees_the_same_in_the_mirror(exact, blind):
     episode = walked(exact)
     one, other = blind.observe(episode), blind.observe(mirror_episode(episode))
