@@ -264,7 +264,7 @@ def test_mjx_walks_and_counts_the_same_things(file):
 
 @pytest.mark.slow
 def test_engines_are_the_same_at_the_same_settings(tmp_path):
-    """With MJX's timestep and its one Newton iteration, MuJoCo C walks the same steps; so does all around it."""
+    """With MJX's timestep and as many Newton iterations, MuJoCo C walks the same steps; so does all around it."""
     from tlq import batch
     from tlq.runtime import load_policy
 
@@ -274,7 +274,7 @@ def test_engines_are_the_same_at_the_same_settings(tmp_path):
     sizes = terrains.TerrainConfig(kind="flat", num_terrains=2, seed=evaluate.FIRST_SEED)
     env = envs.make(batch.evaluation_config(config, sizes, 0.8, noise=False))
     simulation = Simulation(controller, terrains.make_terrain("flat", "paper", 0), config, timestep=0.005)
-    simulation.model.opt.iterations = env.mj_model.opt.iterations
+    simulation.model.opt.iterations = env.config.solver_iterations
     simulation.model.opt.ls_iterations = env.mj_model.opt.ls_iterations
 
     key, towards = jax.random.PRNGKey(0), jnp.asarray(direction, jnp.float32)
