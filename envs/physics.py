@@ -94,40 +94,28 @@ def substep(
       iterations: Newton iterations of the constraint solver.
     """
     with jax.default_matmul_precision("highest"):  # TF32, a GPU's default, ruins contact
-        return _substep(model, data, planes, feet, contact, qfrc, iterations)
-
-
-def _substep(
-    model: mjx.Model,
-    data: mjx.Data,
-    planes: np.ndarray,
-    feet: np.ndarray,
-    contact: Contact,
-    qfrc: jax.Array,
-    iterations: int,
-) -> mjx.Data:
-    data = mjx.kinematics(model, data)
-    _, normal, point = contact(data.geom_xpos[feet])
-    ids = planes.reshape(-1)
-    data = data.replace(
-        geom_xpos=data.geom_xpos.at[ids].set(point.reshape(-1, 3)),
-        geom_xmat=data.geom_xmat.at[ids].set(frame(normal).reshape(-1, 3, 3)),
-        qfrc_applied=qfrc,
-    )
-    data = mjx.com_pos(model, data)
-    data = mjx.crb(model, data)
-    data = mjx.factor_m(model, data)
-    data = mjx.collision(model, data)
-    data = mjx.make_constraint(model, data)
-    data = mjx.com_vel(model, data)
-    data = mjx.rne(model, data)
-    data = mjx.fwd_acceleration(model, data)
-    # The model asks for one iteration, which MJX runs without a loop; starting each from the last one's result gives
-    # the same as more of them at once, and is faster than the loop that MJX has for those.
-    for _ in range(iterations):
-        data = mjx.solve(model, data)
-        data = data.replace(qacc_warmstart=data.qacc)
-    return mjx.euler(model, data)
+        data = mjx.kinematics(model, data)
+        _, normal, point = contact(data.geom_xpos[feet])
+        ids = planes.reshape(-1)
+        data = data.replace(
+            geom_xpos=data.geom_xpos.at[ids].set(point.reshape(-1, 3)),
+            geom_xmat=data.geom_xmat.at[ids].set(frame(normal).reshape(-1, 3, 3)),
+            qfrc_applied=qfrc,
+        )
+        data = mjx.com_pos(model, data)
+        data = mjx.crb(model, data)
+        data = mjx.factor_m(model, data)
+        data = mjx.collision(model, data)
+        data = mjx.make_constraint(model, data)
+        data = mjx.com_vel(model, data)
+        data = mjx.rne(model, data)
+        data = mjx.fwd_acceleration(model, data)
+        # The model asks for one iteration, which MJX runs without a loop; starting each from the last one's result gives
+        # the same as more of them at once, and is faster than the loop that MJX has for those.
+        for _ in range(iterations):
+            data = mjx.solve(model, data)
+            data = data.replace(qacc_warmstart=data.qacc)
+        return mjx.euler(model, data)
 
 
 def settle(model: mujoco.MjModel, robot: Robot, target: np.ndarray, seconds: float = 3.0) -> np.ndarray:
