@@ -110,8 +110,8 @@ def substep(
         data = mjx.com_vel(model, data)
         data = mjx.rne(model, data)
         data = mjx.fwd_acceleration(model, data)
-        # The model asks for one iteration, which MJX runs without a loop; starting each from the last one's result gives
-        # the same as more of them at once, and is faster than the loop that MJX has for those.
+        # The model asks for one iteration, which MJX runs without a loop; starting each from the last one's result
+        # gives the same as more of them at once, and is faster than the loop that MJX has for those.
         for _ in range(iterations):
             data = mjx.solve(model, data)
             data = data.replace(qacc_warmstart=data.qacc)
