@@ -110,12 +110,19 @@ class QuadrupedEnv(Env):
     def begin(self, key: jax.Array, level: jax.Array) -> Episode:
         """A new episode on a level () int32 of the ladder."""
         c = self.config
-        keys = iter(jax.random.split(key, 10))
+        keys = iter(jax.random.split(key, 11))
         lower = jax.random.randint(next(keys), (), 0, jnp.maximum(level, 1))
-        level = jnp.where(jax.random.uniform(next(keys)) < c.curriculum.revisit, lower, level)
+        visited = jnp.where(jax.random.uniform(next(keys)) < c.curriculum.revisit, lower, level)
         # Instance k has difficulty k % levels.
         rows = max(self.bank.num_terrains // self.levels, 1)
-        terrain = (jax.random.randint(next(keys), (), 0, rows) * self.levels + level) % self.bank.num_terrains
+        row, key_practice = jax.random.randint(next(keys), (), 0, rows), next(keys)
+        practised = jax.random.randint(key_practice, (), 0, self.levels)
+        place = lambda level: (row * self.levels + level) % self.bank.num_terrains  # noqa: E731
+        practice = jax.random.uniform(jax.random.fold_in(key_practice, 0)) < c.curriculum.practice
+        practice &= c.curriculum.enabled & (self.bank.floor[place(practised)] < -0.1)
+        counts = (visited == level) & ~practice
+        level = jnp.where(practice, practised, visited)
+        terrain = place(level)
         xy = jax.random.uniform(next(keys), (2,), minval=-1.0, maxval=1.0) * c.spawn_offset
         yaw, angle = jax.random.uniform(next(keys), (2,), minval=-1.0, maxval=1.0) * jnp.array(
             [c.spawn_yaw, jnp.pi]
@@ -131,6 +138,7 @@ class QuadrupedEnv(Env):
         turned = jnp.stack([cos * w, -sin * y, cos * y, sin * w])
         qpos = qpos.at[:2].set(xy).at[2].add(ground).at[3:7].set(turned)
         depth = jnp.asarray(c.curriculum.depth, jnp.float32)[level]
+        depth = jnp.where(practice, c.curriculum.practice_depth, depth)
         return Episode(
             qpos=qpos,
             qvel=jnp.zeros(18),
@@ -139,6 +147,8 @@ class QuadrupedEnv(Env):
             controller=self.core.initial_state(phase),
             terrain=terrain,
             level=level,
+            counts=counts,
+            practice=practice,
             floor=jnp.maximum(self.bank.floor[terrain], -depth),
             command=command,
             origin=xy,
@@ -183,7 +193,8 @@ class QuadrupedEnv(Env):
         }
         metrics = {f"reward/{name}": jnp.where(exploded, 0.0, value) for name, value in weighted.items()}
         metrics |= {
-            f"episode/{name}": jnp.where(done, jnp.float32(value), 0.0) for name, value in ends.items()
+            f"episode/{name}": jnp.where(done & ~before.practice, jnp.float32(value), 0.0)
+            for name, value in ends.items()
         }
         metrics |= {
             "speed": jnp.where(exploded, 0.0, after.qvel[:2] @ after.command),
@@ -205,7 +216,7 @@ class QuadrupedEnv(Env):
             return level
         reachable = min(self.config.rewards.speed_low * self.config.episode_time, GOAL)
         walked = jnp.sum(jnp.square(episode.command)) > 0.5
-        counts = walked & (episode.level == level)  # not what was revisited
+        counts = walked & episode.counts
         up = counts & ~fell & (episode.progress > c.up * reachable)
         down = counts & (episode.progress < c.down * reachable)
         return jnp.clip(level + up.astype(jnp.int32) - down.astype(jnp.int32), 0, self.levels - 1)
@@ -393,7 +404,9 @@ class QuadrupedEnv(Env):
             "smooth": rewards.smooth(after.controller.desired, before.controller.desired),
             "energy": rewards.energy(after.torque, after.qvel[6:], literal=c.literal),
             "terrain": jnp.mean(
-                rewards.terrain(~swing, below[:, near], c.gap_threshold, graded=c.terrain_graded)
+                rewards.terrain(
+                    ~swing, below[:, near], jnp.min(below, axis=1), c.gap_threshold, graded=c.terrain_graded
+                )
             ),
             "height": jnp.mean(
                 jnp.where(swing, rewards.height(after.controller.lift, rise, c.lift_threshold), 0.0)

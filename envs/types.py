@@ -40,6 +40,10 @@ class Episode(flax.struct.PyTreeNode):
     """() int32, instance in the bank."""
     level: jax.Array
     """() int32, level of the ladder that this episode is on."""
+    counts: jax.Array
+    """() bool, whether the episode counts for the ladder: not if an easier level is revisited or footholds practised."""
+    practice: jax.Array
+    """() bool, whether footholds are practised above shallow pits."""
     floor: jax.Array
     """() m, how deep the feet can fall."""
     command: jax.Array

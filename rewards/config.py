@@ -19,13 +19,13 @@ class RewardConfig:
     """Weight of r_smooth."""
     energy: float = 0.0005
     """Weight of r_tau (1/W)."""
-    terrain: float = 1.0
+    terrain: float = 2.5
     """Weight of r_terrain (mean over the feet)."""
     height: float = 1.0
     """Weight of r_height (1/m, mean over the feet)."""
     yaw: float = 0.1
     """Weight of the squared yaw rate (s²/rad²). The paper commands a yaw rate of 0 but has no term for it."""
-    heading: float = 0.3
+    heading: float = 1.0
     """Weight of 1 - cos(drift of the heading since the start). The paper commands no turning; a penalty on the yaw rate
     alone leaves a slow drift, which adds up to radians over 5 m."""
     tilt: float = 0.2

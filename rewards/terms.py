@@ -56,7 +56,9 @@ def energy(torque: jax.Array, joint_velocity: jax.Array, *, literal: bool = Fals
     return -jnp.sum(power if literal else jnp.abs(power), axis=-1)
 
 
-def terrain(stance: jax.Array, below: jax.Array, threshold: float, *, graded: bool = False) -> jax.Array:
+def terrain(
+    stance: jax.Array, below: jax.Array, highest: jax.Array, threshold: float, *, graded: bool = False
+) -> jax.Array:
     """r_terrain,i: a foot in stance is punished for gaps around it.
 
     The paper's cases are exchanged; its text says what is meant: -1 if the leg is in stance and
@@ -65,13 +67,15 @@ def terrain(stance: jax.Array, below: jax.Array, threshold: float, *, graded: bo
     Args:
       stance: (L,) bool.
       below: (L, N) m, z_ij = foot height minus terrain height at the points that are looked at.
+      highest: (L,) m, min_j z_ij over all P points: with the points that are looked at alone, a foot in the middle of a
+        wide gap would be as good as one on the ground.
       threshold: H_thre (m).
       graded: minus the share of points more than H_thre below the highest one.
 
     Returns:
       (L,) in [-1, 0].
     """
-    low = below - jnp.min(below, axis=-1, keepdims=True) > threshold
+    low = below - highest[:, None] > threshold
     punished = jnp.mean(low, axis=-1) if graded else jnp.any(low, axis=-1)
     return -jnp.where(stance, punished, 0.0)
 

@@ -21,6 +21,8 @@ ACTION_HISTORY = 2
 TARGET_HISTORY = 2
 HEIGHT_CLIP = 0.25
 """Heights below the foot are cut to ± this (m): deeper than that, a hole is a hole."""
+TURN_CLIP = 0.5
+"""The turn since the start is shown up to ± this (rad), so that a robot turned round by hand sees nothing new."""
 
 _MIRRORED_LEG = (1, 0, 3, 2)
 
@@ -59,6 +61,8 @@ class ControllerState(NamedTuple):
     """(2, 12) m, last desired foot positions from the abduction joints (trunk frame), newest first."""
     desired: Array
     """(12,) rad, last desired joint angles."""
+    turn: Array
+    """() rad, heading since the start by the integrated gyro, left positive, in [-π, π)."""
 
 
 def _layout(heights: bool) -> tuple[tuple[str, int], ...]:
@@ -72,6 +76,7 @@ def _layout(heights: bool) -> tuple[tuple[str, int], ...]:
         ("phase", 2),
         ("actions", ACTION_HISTORY * ACTION_SIZE),
         ("targets", TARGET_HISTORY * 12),
+        ("turn", 1),
     ]
     return (*parts, ("heights", 100)) if heights else tuple(parts)
 
@@ -131,6 +136,7 @@ class Core:
             actions=xp.zeros((ACTION_HISTORY, ACTION_SIZE), dtype=phase.dtype),
             targets=xp.stack([targets] * TARGET_HISTORY),
             desired=xp.asarray(self.standing_target, dtype=phase.dtype),
+            turn=zero,
         )
 
     def feet(self, sensors: Sensors) -> Array:
@@ -173,6 +179,7 @@ class Core:
             stack([xp.sin(state.phase), xp.cos(state.phase)]),
             xp.reshape(state.actions, (-1,)),
             xp.reshape(10.0 * (xp.reshape(state.targets, (TARGET_HISTORY, 4, 3)) - self.base_foot), (-1,)),
+            xp.reshape(2.0 * xp.clip(state.turn, -TURN_CLIP, TURN_CLIP), (1,)),
         ]
         if self.heights:
             # z_ij = f_ij - h_ij: how far the terrain lies below the foot.
@@ -221,6 +228,7 @@ class Core:
             self.geometry, wanted, c.weight_compensation * self.sag * load_share(phases, gate)
         )
         desired = xp.clip(xp.reshape(wanted + sag, (12,)), self.lower, self.upper)
+        rate = frames.yaw_rate(frames.up_in_trunk(sensors.orientation), sensors.angular_velocity)
         state = ControllerState(
             phase=phase,
             frequency=frequency,
@@ -231,6 +239,7 @@ class Core:
             actions=stack([action, *state.actions[: ACTION_HISTORY - 1]], axis=-2),
             targets=stack([xp.reshape(reached, (12,)), *state.targets[: TARGET_HISTORY - 1]], axis=-2),
             desired=desired,
+            turn=path.wrap(state.turn + self.dt * rate),
         )
         return state, desired
 
@@ -318,6 +327,7 @@ _KIND = {
     "joint_velocity": "joints",
     "frequency": "scalar",
     "phase": "phase",
+    "turn": "odd",
     "heights": "heights",
 }
 
@@ -334,6 +344,8 @@ def _mirror_part(kind: str, size: int) -> tuple[list[int], list[float]]:
         return list(range(size)), [1.0, -1.0, 1.0][:size]
     if kind == "axial":
         return list(range(size)), [-1.0, 1.0, -1.0][:size]
+    if kind == "odd":
+        return list(range(size)), [-1.0] * size
     if kind == "phase":  # LF's mirror image is RF, half a cycle away: sine and cosine change sign
         return list(range(size)), [-1.0] * size
     if kind == "joints":

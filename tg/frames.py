@@ -31,6 +31,19 @@ def yaw(quaternion: Array) -> Array:
     return xp.arctan2(2 * (x * y + w * z), 1 - 2 * (y * y + z * z))
 
 
+def yaw_rate(up: Array, angular_velocity: Array) -> Array:
+    """Rate (...) rad/s at which the heading turns.
+
+    Args:
+      up: (..., 3) the world's up direction in the trunk's frame.
+      angular_velocity: (..., 3) rad/s, trunk frame.
+    """
+    xp = up.__array_namespace__()
+    # (ω_y sin roll + ω_z cos roll) / cos pitch
+    across = up[..., 1] * angular_velocity[..., 1] + up[..., 2] * angular_velocity[..., 2]
+    return across / xp.maximum(1.0 - up[..., 0] ** 2, 0.1 + 0.0 * across)
+
+
 def heading_from_trunk(up: Array) -> Array:
     """Rotation (..., 3, 3) that turns vectors of the trunk's frame into the heading frame, from roll and pitch.
 

@@ -8,6 +8,8 @@ Array = Any
 RINGS = ((1, 0.0), (6, 0.03), (8, 0.06), (10, 0.10))
 """Points and radius (m) of each circle."""
 
+COUNT = sum(count for count, _ in RINGS)
+"""P = 25."""
 RING_OF_POINT = tuple(ring for ring, (count, _) in enumerate(RINGS) for _ in range(count))
 """Index into `RINGS` of each of the P = 25 points."""
 

@@ -56,6 +56,8 @@ def write(
     extra_metadata: Mapping[str, Any] | None = None,
 ) -> None:
     """As `export_policy`, from arrays by their names in a checkpoint, e.g. 'normaliser.mean.state'."""
+    from tlq.networks import LEG_SIGN
+
     kept = {
         n: np.asarray(x, np.float32) for n, x in arrays.items() if n.startswith(_PARAMS) or n in (_MEAN, _STD)
     }
@@ -65,6 +67,8 @@ def write(
         raise ValueError(
             f"the normaliser is for {kept[_MEAN].size} observed values, the environment shows {size}"
         )
+    if "leg_action" in {name.removeprefix(_PARAMS).partition(".")[0] for name in kept}:
+        kept["leg_sign"] = LEG_SIGN
     nodes = policy_graph(config.policy, kept, heights=100 if config.env.method != "blind" else 0)
     Graph(nodes, kept)
     _save(Path(path), nodes, kept, metadata)
@@ -237,7 +241,7 @@ def policy_graph(policy: Any, arrays: Mapping[str, np.ndarray], heights: int) ->
       arrays: initialisers, for their shapes.
       heights: how many of the last entries of the observation are heights (not normalised).
     """
-    from tlq.networks import CLIP
+    from tlq.networks import CLIP, SAME_SIDE
 
     b, size = _Builder(), arrays[_MEAN].size
     normal = b.add("Div", b.add("Sub", "observation", _MEAN), _STD)
@@ -245,11 +249,12 @@ def policy_graph(policy: Any, arrays: Mapping[str, np.ndarray], heights: int) ->
     if heights:
         proprio = b.add("Slice", normal, axes=[-1], starts=[0], ends=[size - heights])
         foot = b.add("Slice", "observation", axes=[-1], starts=[size - heights], ends=[size])
+        foot = b.add("Gather", foot, axis=-1, indices=SAME_SIDE.tolist())
         foot = b.add("Reshape", foot, shape=[policy.feet, heights // policy.feet])
         for i in range(len(policy.foot_encoder)):
             foot = b.elu(f"foot_{i}", foot)
-        foot = b.add("Reshape", foot, shape=[policy.feet * policy.foot_encoder[-1]])
-        x = b.add("Concat", b.elu("proprio", proprio), foot, axis=-1)
+        flat = b.add("Reshape", foot, shape=[policy.feet * policy.foot_encoder[-1]])
+        x = b.add("Concat", b.elu("proprio", proprio), flat, axis=-1)
     else:
         x = b.elu("proprio", normal)
     x = b.elu("mix", x)
@@ -258,6 +263,12 @@ def policy_graph(policy: Any, arrays: Mapping[str, np.ndarray], heights: int) ->
     y = b.elu("head", b.add("Concat", x, y, axis=-1))
     actions = arrays[f"{_PARAMS}action.bias"].size // 2
     mean, _ = b.split(b.dense("action", y), actions, actions)
+    if heights and policy.leg_head:
+        shared, residuals = b.split(mean, 2, actions - 2)
+        context = b.add("Reshape", b.dense("to_legs", y), shape=[policy.feet, policy.leg_context])
+        leg = b.dense("leg_action", b.elu("leg", b.add("Concat", foot, context, axis=-1)))
+        leg = b.add("Reshape", b.add("Mul", leg, "leg_sign"), shape=[actions - 2])
+        mean = b.add("Concat", shared, b.add("Add", residuals, leg), axis=-1)
     b.add("Tanh", mean, outputs=("action",))
     return b.nodes
 
@@ -297,6 +308,7 @@ def write_onnx(path: str | os.PathLike[str], policy_file: str | os.PathLike[str]
             "axes",
             "split",
             "shape",
+            "indices",
             "min",
             "max",
         ):  # attributes that became inputs

@@ -77,6 +77,21 @@ def _reshape(attributes: dict[str, Any]) -> Kernel:
     return lambda x: x.__array_namespace__().reshape(x, shape)
 
 
+def _gather(attributes: dict[str, Any]) -> Kernel:
+    _last_axis(attributes)
+    indices = [int(index) for index in attributes.pop("indices")]
+    highest = max(indices, default=0)
+    if min(indices, default=0) < 0:
+        raise GraphError("Gather takes indices from 0 on")
+
+    def gather(x: Array) -> Array:
+        if x.shape[-1] <= highest:  # JAX would clamp it
+            raise GraphError(f"can't take value {highest} of {x.shape[-1]}")
+        return x[..., x.__array_namespace__().asarray(indices)]
+
+    return gather
+
+
 def _clip(attributes: dict[str, Any]) -> Kernel:
     low, high = float(attributes.pop("min")), float(attributes.pop("max"))
     return lambda x: x.__array_namespace__().clip(x, low, high)
@@ -94,6 +109,7 @@ OPERATORS: dict[str, tuple[int | None, Callable[[dict[str, Any]], Kernel]]] = {
     "Concat": (None, _concat),
     "Div": (2, _simple(lambda a, b: a / b)),
     "Elu": (1, _simple(_elu)),
+    "Gather": (1, _gather),
     "Identity": (1, _simple(lambda x: x)),
     "LayerNormalization": (3, _normalization),
     "MatMul": (2, _simple(lambda a, b: a @ b)),

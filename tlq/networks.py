@@ -10,6 +10,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from brax.training.acme.running_statistics import NestedMeanStd
 from brax.training.acme.running_statistics import normalize as normalise
 from brax.training.agents.ppo.networks import PPONetworks
@@ -17,10 +18,22 @@ from brax.training.distribution import NormalTanhDistribution
 from brax.training.networks import FeedForwardNetwork
 from flax import linen as nn
 
+import tg
 from tlq.memory import Dense, Memory, carry_size
 
 CLIP = 10.0  # normalised observations are clipped to +-CLIP standard deviations
 MIN_STD = 0.001
+
+SAME_SIDE = np.array(
+    [
+        leg * tg.samples.COUNT + point
+        for leg in range(4)
+        for point in (tg.samples.mirrored_points() if leg % 2 else range(tg.samples.COUNT))
+    ]
+)
+"""Order of the 100 heights in which the right legs' (RF, RR) are those of left legs in the mirror."""
+LEG_SIGN = np.array([[1, 1, 1], [-1, 1, 1]] * 2, np.float32)
+"""(4, 3) turns a left leg's residuals (abduction, hip, knee) into the same leg's."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,6 +52,11 @@ class NetworkConfig:
     """Widths of the encoder of one foot's heights; its weights are shared by the four feet."""
     head: int = 64
     """Width of the layer before the action."""
+    leg_head: int = 32
+    """Width of the layer that turns what one foot sees into that leg's residuals, its weights shared by the four legs: what
+    one leg learns about an edge, all of them know. 0: none."""
+    leg_context: int = 16
+    """Width of what the rest of the network tells each leg's head."""
     critic: tuple[int, ...] = (128, 128)
     """Hidden widths of the critic."""
     initial_std: float = 0.3
@@ -108,7 +126,10 @@ class Policy(nn.Module):
         """
         c = self.config
         x = nn.elu(Dense(c.encoder, name="proprio")(proprio))
+        foot = None
         if heights is not None:
+            if heights.shape[-1] == c.feet * tg.samples.COUNT:
+                heights = heights[..., SAME_SIDE]
             foot = heights.reshape(*heights.shape[:-1], c.feet, heights.shape[-1] // c.feet)
             for i, width in enumerate(c.foot_encoder):
                 foot = nn.elu(Dense(width, name=f"foot_{i}")(foot))
@@ -123,7 +144,17 @@ class Policy(nn.Module):
         out = Dense(
             2 * self.action_size, kernel_init=small, bias_init=_head_bias(c.initial_std), name="action"
         )
-        return {"action": out(y), "carry": carry}
+        action = out(y)
+        if foot is not None and c.leg_head and self.action_size == 2 + 3 * c.feet:
+            context = Dense(c.feet * c.leg_context, name="to_legs")(y)
+            context = context.reshape(*foot.shape[:-1], c.leg_context)
+            leg = nn.elu(Dense(c.leg_head, name="leg")(jnp.concatenate([foot, context], axis=-1)))
+            leg = Dense(3, kernel_init=small, name="leg_action")(leg) * LEG_SIGN
+            # Means are [δf, δh, 12 residuals, ...].
+            rest = [(0, 0)] * (action.ndim - 1)
+            leg = leg.reshape(*leg.shape[:-2], 3 * c.feet)
+            action = action + jnp.pad(leg, [*rest, (2, 2 * self.action_size - 2 - 3 * c.feet)])
+        return {"action": action, "carry": carry}
 
 
 class Critic(nn.Module):

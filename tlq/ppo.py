@@ -35,7 +35,7 @@ class PPOConfig:
     """Steps T of each environment per iteration; 40 steps are one gait cycle at 1.25 Hz."""
     epochs: int = 2
     """Passes over the data of an iteration."""
-    minibatches: int = 4
+    minibatches: int = 8
     """Gradient steps of a pass; each takes B / minibatches whole pieces of T steps."""
     discount: float = 0.99
     """Discount of a step."""
@@ -49,9 +49,9 @@ class PPOConfig:
     """Lower bound of the adaptive learning rate."""
     learning_rate_max: float = 1e-3
     """Upper bound of the adaptive learning rate."""
-    kl_target: float = 0.01
+    kl_target: float = 0.02
     """KL(old, new) of an iteration that the learning rate is steered to; 0 keeps the learning rate."""
-    entropy: float = 3e-3
+    entropy: float = 1e-3
     """Weight of the entropy bonus."""
     value_loss: float = 0.5
     """Weight of the value loss (which has a factor 1/2 of its own)."""

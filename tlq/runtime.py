@@ -96,6 +96,10 @@ class Controller:
         self.action = np.zeros(tg.ACTION_SIZE, np.float32)
         """(14,) what the policy gave last, in (-1, 1)."""
 
+    def keep_heading(self) -> None:
+        """Takes the present heading as the one to keep (at first that of `reset`), while everything else goes on."""
+        self.state = self.state._replace(turn=0.0 * self.state.turn)
+
     def example_sensors(self) -> dict[str, np.ndarray]:
         """Sensors of a robot that stands level.
 

@@ -37,4 +37,5 @@ def mirror_state(state):
         actions=actions,
         targets=targets,
         desired=mirror_joints(state.desired),
+        turn=-state.turn,
     )

@@ -220,7 +220,7 @@ def test_observation_by_parts(subject):
     heights = np.full((4, 25), -0.3)
     heights[:, 5], heights[:, 6] = -1.0, 0.5
     observation = core.observe(state, sensors, heights, LEFT)
-    assert observation.shape == (core.observation_size,) == (187,)
+    assert observation.shape == (core.observation_size,) == (188,)
     seen = parts(core, observation)
     np.testing.assert_allclose(seen["command"], LEFT)
     np.testing.assert_allclose(seen["up"], tg.frames.rotation(sensors.orientation)[2])
@@ -232,6 +232,9 @@ def test_observation_by_parts(subject):
     np.testing.assert_allclose(seen["actions"], state.actions.reshape(-1))
     targets = state.targets.reshape(2, 4, 3) - core.base_foot
     np.testing.assert_allclose(seen["targets"], 10 * targets.reshape(-1), atol=1e-12)
+    np.testing.assert_allclose(seen["turn"], 2.0 * state.turn)
+    far = core.observe(state._replace(turn=np.asarray(-2.5)), sensors, heights, LEFT)
+    np.testing.assert_allclose(parts(core, far)["turn"], -1.0)  # cut at half a radian
     # z = f - h: positive where the ground lies below the foot; a hole deeper than 25 cm is 25 cm deep.
     below = seen["heights"].reshape(4, 25)
     np.testing.assert_allclose(below[:, 0], 5 * (feet[:, 2] + 0.3))
@@ -266,6 +269,25 @@ def test_absolute_yaw_is_neither_seen_nor_acted_on(subject, angle):
     ]
     for one, other in zip(*views, strict=True):
         np.testing.assert_allclose(one, other, atol=1e-9)
+
+
+def test_the_turn_is_the_integrated_yaw_rate(subject):
+    """A level robot that turns at 1 rad/s for 3 s, then at -0.5 rad/s for 1 s; beyond half a turn it wraps."""
+    core = subject.core
+    state = core.initial_state(np.asarray(0.5 * np.pi))
+    level = random_sensors(core, 0)._replace(orientation=np.array([1.0, 0, 0, 0]))
+    turned = 0.0
+    for step in range(200):
+        rate = 1.0 if step < 150 else -0.5
+        sensors = level._replace(angular_velocity=np.array([0.3, -0.2, rate]))
+        state, _ = core.act(state, np.zeros(14), sensors, LEFT)
+        turned += rate * core.dt
+        np.testing.assert_allclose(state.turn, turned, atol=1e-9)
+    for _ in range(100):
+        state, _ = core.act(
+            state, np.zeros(14), level._replace(angular_velocity=np.array([0, 0, 1.0])), LEFT
+        )
+    np.testing.assert_allclose(state.turn, turned + 2.0 - 2.0 * np.pi, atol=1e-9)
 
 
 # Mirror symmetry ----------------------------------------------------------------------------------------------
@@ -315,7 +337,7 @@ def test_mirror_has_hysteresis(subject):
 def test_mirroring_twice_changes_nothing(subject):
     core = subject.core
     index, sign = core._observation_mirror
-    np.testing.assert_array_equal(np.arange(187)[index][index], np.arange(187))
+    np.testing.assert_array_equal(np.arange(188)[index][index], np.arange(188))
     np.testing.assert_array_equal(sign * sign[index], 1.0)
     action = np.random.default_rng(0).uniform(-1, 1, 14)
     once = core.mirror_action(np.asarray(-1.0), action)

@@ -77,3 +77,14 @@ def test_batches():
     assert together.shape == frames.rotation(quaternion).shape == (5, 3, 3, 3)
     alone = frames.heading_from_trunk(frames.up_in_trunk(quaternion[2, 1]))
     np.testing.assert_allclose(together[2, 1], alone, atol=1e-12)
+
+
+@given(quaternions, st.lists(st.floats(-3, 3), min_size=3, max_size=3).map(np.array))
+def test_yaw_rate_is_the_yaws_derivative(quaternion, velocity):
+    assume(abs(mujoco_rotation(quaternion)[2, 0]) < 0.9)
+    h = 1e-6
+    after, before = quaternion.copy(), quaternion.copy()
+    mujoco.mju_quatIntegrate(after, velocity, h)
+    mujoco.mju_quatIntegrate(before, velocity, -h)
+    change = np.angle(np.exp(1j * (frames.yaw(after) - frames.yaw(before)))) / (2 * h)
+    np.testing.assert_allclose(frames.yaw_rate(frames.up_in_trunk(quaternion), velocity), change, atol=1e-4)
