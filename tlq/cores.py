@@ -1,4 +1,4 @@
-"""Puts all cores of a CPU to work; must run before JAX starts."""
+"""Puts all cores of a CPU, or several hosts, to work; must run before JAX starts."""
 
 import os
 
@@ -16,3 +16,19 @@ def use_all_cores() -> None:
         os.environ["XLA_FLAGS"] = f"{flags} --xla_force_host_platform_device_count={devices}".strip()
     # Devices share a pool of threads and wait for one another in it: with only as many threads as cores, they deadlock.
     os.environ.setdefault("PJRT_NPROC", str(4 * cores))
+
+
+def join(coordinator: str, processes: int, process: int) -> None:
+    """Joins the processes of several hosts into one; each sees the devices of all, and only its own are its to address.
+
+    Args:
+      coordinator: host:port of process 0, or "auto" where JAX finds everything by itself (Slurm, Open MPI, Kubernetes).
+      processes: how many there are.
+      process: number of this one, from 0.
+    """
+    import jax
+
+    if coordinator == "auto":
+        jax.distributed.initialize()
+    else:
+        jax.distributed.initialize(coordinator, processes, process)

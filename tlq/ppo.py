@@ -1,4 +1,4 @@
-"""Recurrent PPO (arXiv 1707.06347) on Brax's loss, running statistics and environments: our own loop around them.
+"""Recurrent PPO (arXiv 1707.06347) on Brax's parts: our own loop around them.
 
 Letters: B environments, T = unroll steps, M minibatches. One call of `Learner.step` is one iteration: T steps of
 every environment, then `epochs` passes over M minibatches. Environments are split over the devices of a mesh axis
@@ -7,6 +7,7 @@ every environment, then `epochs` passes over M minibatches. Environments are spl
 
 import dataclasses
 import functools
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -17,14 +18,17 @@ import numpy as np
 import optax
 from brax.envs.base import Env, State
 from brax.training.acme import running_statistics
-from brax.training.agents.ppo.losses import PPONetworkParams, compute_ppo_loss
+from brax.training.agents.ppo.losses import PPONetworkParams
 from brax.training.agents.ppo.networks import PPONetworks
-from brax.training.types import Transition
 from jax.sharding import Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
 
+from tlq.loss import LossConfig, ppo_loss
+
 AXIS = "data"
 NORMALISED = ("state", "privileged_state")
+STREAMS = 16
+"""Groups of environments that are shuffled each by itself, so that a minibatch doesn't depend on the number of devices."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -139,14 +143,17 @@ class Learner:
             optax.clip_by_global_norm(config.max_grad_norm), optax.scale_by_adam(eps=1e-5)
         )
         self._loss = functools.partial(
-            compute_ppo_loss,
-            ppo_network=networks,
-            entropy_cost=config.entropy,
-            discounting=config.discount,
-            reward_scaling=config.reward_scaling,
-            gae_lambda=config.gae_lambda,
-            clipping_epsilon=config.clip,
-            vf_coefficient=config.value_loss,
+            ppo_loss,
+            networks=networks,
+            config=LossConfig(
+                discount=config.discount,
+                gae_lambda=config.gae_lambda,
+                clip=config.clip,
+                entropy=config.entropy,
+                value_loss=config.value_loss,
+                reward_scaling=config.reward_scaling,
+            ),
+            axis=AXIS,
         )
         specs: list[Any] = [P(), P(), P(), P(), P(AXIS), P(), P()]  # only the environments are split
         self.specs = TrainState(*specs)
@@ -162,6 +169,12 @@ class Learner:
                 check_vma=False,
             )
         )
+
+    @property
+    def streams(self) -> int:
+        """Streams over all devices."""
+        streams = math.gcd(STREAMS, self.num_envs // self.config.minibatches)
+        return streams if streams % self.devices == 0 else self.devices
 
     def step(self, state: TrainState) -> tuple[TrainState, dict[str, jax.Array]]:
         """One iteration: the next state, and the figures () of this one."""
@@ -224,8 +237,7 @@ class Learner:
     def _iteration(
         self, constants: list[jax.Array], state: TrainState
     ) -> tuple[TrainState, dict[str, jax.Array]]:
-        key, key_here = jax.random.split(state.key)
-        key_rollout, key_update = jax.random.split(jax.random.fold_in(key_here, jax.lax.axis_index(AXIS)))
+        key, key_rollout, key_update = jax.random.split(state.key, 3)
         carry = state.env_state.obs["carry"]
         env_state, rollout, env_metrics = self._rollout(constants, state, key_rollout)
         params, opt_state, losses = self._update(
@@ -260,11 +272,12 @@ class Learner:
     ) -> tuple[State, Rollout, dict[str, jax.Array]]:
         """T steps with sampled actions; metrics are sums over T and means over B, see `summarise`."""
         policy, distribution = self.networks.policy_network, self.networks.parametric_action_distribution
+        numbers = self._numbers()
 
         def step(env_state: State, key: jax.Array):
             obs = env_state.obs
             parameters = policy.apply(state.normaliser, state.params.policy, obs)
-            raw = distribution.sample_no_postprocessing(parameters, key)
+            raw = jax.vmap(distribution.sample_no_postprocessing)(parameters, _keys(key, numbers))
             after = self._env_step(constants, env_state, distribution.postprocess(raw))
             rollout = Rollout(
                 observation={k: obs[k] for k in (*NORMALISED, "is_first")},
@@ -284,6 +297,23 @@ class Learner:
         metrics = jax.tree.map(lambda x: jax.lax.pmean(jnp.mean(x, axis=0), AXIS), metrics)
         return env_state, rollout, summarise(metrics, self.steps_per_iteration)
 
+    def _numbers(self) -> jax.Array:
+        """Numbers (B,) of this device's environments among those of all devices."""
+        here = self.num_envs // self.devices
+        return jax.lax.axis_index(AXIS) * here + jnp.arange(here)
+
+    def _minibatches(self, key: jax.Array) -> jax.Array:
+        """This device's environments (epochs x M, B / M), shuffled stream by stream anew in each pass."""
+        c, here = self.config, self.streams // self.devices
+        size = self.num_envs // self.streams
+
+        def order(stream: jax.Array) -> jax.Array:
+            keys = jax.random.split(jax.random.fold_in(key, jax.lax.axis_index(AXIS) * here + stream), c.epochs)
+            return stream * size + jax.vmap(lambda k: jax.random.permutation(k, size))(keys)
+
+        orders = jax.vmap(order)(jnp.arange(here)).reshape(here, c.epochs, c.minibatches, -1)
+        return jnp.moveaxis(orders, 0, 2).reshape(c.epochs * c.minibatches, -1)
+
     def _update(
         self, state: TrainState, carry: jax.Array, rollout: Rollout, last: jax.Array, key: jax.Array
     ) -> tuple[PPONetworkParams, Any, dict[str, jax.Array]]:
@@ -292,17 +322,15 @@ class Learner:
         carry: (B, C) from before the first step; last: (B, V) 'privileged_state' after the last.
         """
         c = self.config
-        envs = rollout.reward.shape[1]
         key_order, key_loss = jax.random.split(key)
-        orders = jax.vmap(lambda k: jax.random.permutation(k, envs))(jax.random.split(key_order, c.epochs))
-        chosen = orders.reshape(c.epochs * c.minibatches, envs // c.minibatches)
+        chosen, numbers = self._minibatches(key_order), self._numbers()
 
         def gradient_step(carried, inputs):
             params, opt_state = carried
             index, key = inputs
-            batch = as_transition(jax.tree.map(lambda x: x[:, index], rollout), carry[index], last[index])
+            batch = jax.tree.map(lambda x: x[:, index], rollout)
             (_, losses), grads = jax.value_and_grad(self._loss, has_aux=True)(
-                params, state.normaliser, batch, key
+                params, state.normaliser, batch, carry[index], last[index], _keys(key, numbers[index])
             )
             grads, losses = jax.lax.pmean((grads, losses), AXIS)
             updates, opt_state = self._optimiser.update(grads, opt_state)
@@ -317,28 +345,9 @@ class Learner:
         return params, opt_state, _loss_metrics(losses, c.minibatches)
 
 
-def as_transition(rollout: Rollout, carry: jax.Array, last_privileged: jax.Array) -> Transition:
-    """A rollout in the form, and with the leading axes [B, T], that Brax's loss takes.
-
-    The loss reads the carry of the first step and the next observation of the last step only, so those are all there
-    is. It swaps the axes back at once; the compiler removes both swaps.
-    """
-    data = Transition(
-        observation=dict(rollout.observation, carry=carry[None]),
-        action=(),
-        reward=rollout.reward,
-        discount=1 - rollout.done,
-        next_observation={"privileged_state": last_privileged[None]},
-        extras={
-            "state_extras": {"truncation": rollout.truncation},
-            "policy_extras": {
-                "raw_action": {"action": rollout.action},
-                "log_prob": rollout.log_prob,
-                "distribution_params": {"action": rollout.parameters},
-            },
-        },
-    )
-    return jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), data)
+def _keys(key: jax.Array, numbers: jax.Array) -> jax.Array:
+    """A key for each environment, by its number."""
+    return jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, numbers)
 
 
 def summarise(means: dict[str, jax.Array], steps: int) -> dict[str, jax.Array]:
@@ -357,16 +366,8 @@ def summarise(means: dict[str, jax.Array], steps: int) -> dict[str, jax.Array]:
 
 def _loss_metrics(losses: dict[str, jax.Array], minibatches: int) -> dict[str, jax.Array]:
     """Means over the gradient steps (each (epochs x minibatches,)); `kl_last` over the last pass."""
-    names = {
-        "policy_loss": "loss/policy",
-        "v_loss": "loss/value",
-        "entropy_loss": "loss/entropy",
-        "total_loss": "loss/total",
-        "grad_norm": "loss/grad_norm",
-        "policy_dist_mean_std": "std",
-        "policy_dist_max_std": "std_max",
-    }
-    figures = {new: jnp.mean(losses[old]) for old, new in names.items()}
-    finite = jnp.isfinite(losses["total_loss"]) & jnp.isfinite(losses["grad_norm"])
-    kl = losses["kl_mean"]
+    figures = {f"loss/{n}": jnp.mean(losses[n]) for n in ("policy", "value", "entropy", "total", "grad_norm")}
+    figures |= {n: jnp.mean(losses[n]) for n in ("std", "std_max")}
+    finite = jnp.isfinite(losses["total"]) & jnp.isfinite(losses["grad_norm"])
+    kl = losses["kl"]
     return dict(figures, kl=jnp.mean(kl), kl_last=jnp.mean(kl[-minibatches:]), finite=jnp.all(finite))

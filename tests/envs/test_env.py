@@ -119,8 +119,8 @@ def test_nothing_of_an_episode_outlives_it(noisy):
     exploded = change(walked, qvel=walked.pipeline_state.qvel.at[4].set(jnp.nan))
     ends = []
     for i, state in enumerate((fresh, walked, exploded)):
-        # An episode on another level than the environment's was revisited: it doesn't count for the ladder.
-        state = last_step(noisy, state, level=1 if i else 2).replace(
+        # A revisited level, which doesn't count for the ladder.
+        state = last_step(noisy, state, counts=False, level=1 if i else 2).replace(
             info={**state.info, "level": jnp.int32(level)}
         )
         state = state.replace(pipeline_state=state.pipeline_state.replace(key=key))
@@ -156,9 +156,10 @@ def test_episodes_begin_on_the_platform_at_rest(exact):
         assert episode.heading == pytest.approx(float(tg.frames.yaw(episode.qpos[3:7])), abs=1e-5)
         assert np.linalg.norm(episode.command) == pytest.approx(1.0)
         assert not np.asarray(episode.qvel).any()
-        level = int(episode.level)
-        assert level <= 7 and int(episode.terrain) % exact.env.levels == level
-        depth = c.curriculum.depth[level]
+        level, practice = int(episode.level), bool(episode.practice)
+        assert (level <= 7 or practice) and int(episode.terrain) % exact.env.levels == level
+        assert bool(episode.counts) == (level == 7 and not practice) or practice
+        depth = c.curriculum.practice_depth if practice else c.curriculum.depth[level]
         assert episode.floor == pytest.approx(max(float(exact.env.bank.floor[episode.terrain]), -depth))
         lowest = exact.kinematics(episode.qpos).geom_xpos[exact.env.robot.foot_geom_ids, 2].min()
         assert lowest == pytest.approx(exact.env.robot.foot_radius, abs=0.002)
@@ -325,16 +326,14 @@ def test_ladder(exact):
     assert (env.config.rewards.speed_low, env.config.episode_time) == (0.35, 10.0)
     episode = exact.begin(jax.random.key(0), jnp.int32(4))
 
-    def after(progress, *, fell=False, level=4, own=None, command=(1.0, 0.0), env=env):
-        changed = change_episode(
-            episode, progress=progress, level=level if own is None else own, command=np.array(command)
-        )
+    def after(progress, *, fell=False, level=4, counts=True, command=(1.0, 0.0), env=env):
+        changed = change_episode(episode, progress=progress, counts=counts, command=np.array(command))
         return int(env.next_level(changed, jnp.int32(level), jnp.asarray(fell)))
 
     assert after(2.46) == 5 and after(2.44) == 4
     assert after(2.46, fell=True) == 4  # far, but not to the end
     assert after(1.23) == 4 and after(1.22) == 3 and after(1.22, fell=True) == 3
-    assert after(5.0, own=2) == 4 and after(0.0, own=2) == 4  # what was revisited doesn't count
+    assert after(5.0, counts=False) == 4 and after(0.0, counts=False) == 4  # revisited or practised
     assert after(0.0, command=(0.0, 0.0)) == 4  # nor does standing
     top = env.levels - 1
     assert after(5.0, level=top) == top and after(0.0, level=0) == 0
@@ -348,19 +347,31 @@ def test_auto_reset_climbs_and_descends(noisy):
     level = jnp.int32(4)
     command = np.array([1.0, 0.0])
     for progress, expected in [(3.0, 5), (2.0, 4), (0.5, 3)]:
-        state = last_step(noisy, noisy.state, level=4, progress=progress, command=command)
+        state = last_step(
+            noisy, noisy.state, counts=True, practice=False, level=4, progress=progress, command=command
+        )
         after = noisy.step(state.replace(info={**state.info, "level": level}), ZERO)
         assert after.done == 1 and int(after.info["level"]) == expected
-        assert int(after.pipeline_state.level) <= expected
+        episode = after.pipeline_state
+        assert int(episode.level) <= expected or bool(episode.practice)
         assert after.metrics["episode/level"] == pytest.approx(4 / 11)
 
 
 def test_levels_at_the_start_and_revisits(exact):
     c = exact.config.curriculum
     keys = jax.random.split(jax.random.key(0), 2000)
-    levels = np.asarray(jax.jit(jax.vmap(lambda key: exact.env.begin(key, jnp.int32(5)).level))(keys))
-    assert levels.max() == 5 and levels.min() == 0
-    assert (levels < 5).mean() == pytest.approx(c.revisit, abs=0.03)
+    begun = jax.jit(jax.vmap(lambda key: exact.env.begin(key, jnp.int32(5))))(keys)
+    levels, counts, practice, floor = map(np.asarray, (begun.level, begun.counts, begun.practice, begun.floor))
+    own = levels[~practice]
+    assert own.max() == 5 and own.min() == 0
+    assert (own < 5).mean() == pytest.approx(c.revisit, abs=0.04)
+    np.testing.assert_array_equal(counts, ~practice & (levels == 5))
+    # Footholds are practised on every level, where there are pits at all, and in shallow ones.
+    deep = np.asarray(exact.env.bank.floor)[np.asarray(begun.terrain)] < -0.1
+    assert deep[practice].all() and set(levels[practice]) == set(range(exact.env.levels))
+    np.testing.assert_allclose(floor[practice], -c.practice_depth)
+    share = np.mean(np.asarray(exact.env.bank.floor) < -0.1)
+    assert practice.mean() == pytest.approx(c.practice * share, abs=0.05)
     starts = np.asarray(jax.jit(jax.vmap(lambda key: exact.env.reset(key).info["level"]))(keys))
     assert set(starts) == set(range(c.start + 1))
 
@@ -511,7 +522,7 @@ def test_each_term_is_logged_by_itself(exact):
 
 
 def test_terrain_term_looks_at_the_feet_in_stance(exact):
-    """All feet over the pit, a stone's edge within 3 cm of LF alone: the share of low points there, a quarter of it."""
+    """A pole's edge within 3 cm of LF: the mean over the feet of the share of low points within 3 cm."""
     env, k = exact.env, exact.find("poles", 9)
     terrain = exact.terrain(k)
     row = terrain.primitives[np.argmin(np.abs(terrain.primitives[:, :2] - [0.9, 0.6]).sum(axis=1))]
@@ -521,12 +532,13 @@ def test_terrain_term_looks_at_the_feet_in_stance(exact):
     below, around = env._terrain_at_feet(episode)
     terms = env._reward_terms(episode, episode, below, around)
     phases = tg.path.leg_phases(np.asarray(episode.controller.phase))
-    near = np.array(tg.samples.ring_offsets())[:7]
+    rings = np.array(tg.samples.ring_offsets())
     heights = terrains.exact_height(
-        terrain, cell_centres(env.bank, feet[:, None, :2] + near + centre - feet[0, :2])
+        terrain, cell_centres(env.bank, feet[:, None, :2] + rings + centre - feet[0, :2])
     )
-    low = (heights.max(axis=1, keepdims=True) - heights > exact.config.rewards.gap_threshold).mean(axis=1)
-    assert low[0] > 0
+    deep = heights.max(axis=1, keepdims=True) - heights > exact.config.rewards.gap_threshold
+    low = deep[:, :7].mean(axis=1)
+    assert 0 < low[0] < 1
     np.testing.assert_allclose(terms["terrain"], -(low * (phases <= 0)).mean(), atol=1e-6)
     standing_terms = env._reward_terms(episode, change_episode(episode, command=np.zeros(2)), below, around)
     np.testing.assert_allclose(standing_terms["terrain"], -low.mean(), atol=1e-6)  # all feet stand

@@ -99,18 +99,24 @@ def test_energy():
 def test_terrain_step_by_step():
     stance = jnp.array([True, True, True, False])
     below = jnp.tile(jnp.array([0.02, 0.02, 0.05, 0.02]), (4, 1))
+    highest = jnp.full(4, 0.02)
     for depth, graded, expected in [
         # Sample 0 lies `depth` under the foot, the highest one 2 cm: the gap is depth - 0.02.
         (0.269, False, [0, 0, 0, 0]),  # 24.9 cm is no gap
         (0.271, False, [-1, -1, -1, 0]),  # 25.1 cm is; a leg in swing isn't judged
         (0.271, True, [-0.25, -0.25, -0.25, 0]),  # one of four points
     ]:
-        found = rewards.terrain(stance, below.at[:, 0].set(depth), 0.25, graded=graded)
+        found = rewards.terrain(stance, below.at[:, 0].set(depth), highest, 0.25, graded=graded)
         np.testing.assert_allclose(found, expected, atol=1e-6)
     # Half of the points over the gap; the foot's own height doesn't matter.
     half = below.at[:, :2].set(0.5) + 0.3
-    np.testing.assert_allclose(rewards.terrain(stance, half, 0.25, graded=True), [-0.5, -0.5, -0.5, 0])
-    np.testing.assert_allclose(rewards.terrain(stance, half, 0.25), [-1, -1, -1, 0])
+    highest = highest + 0.3
+    np.testing.assert_allclose(
+        rewards.terrain(stance, half, highest, 0.25, graded=True), [-0.5, -0.5, -0.5, 0]
+    )
+    np.testing.assert_allclose(rewards.terrain(stance, half, highest, 0.25), [-1, -1, -1, 0])
+    # All four points in a gap that is wider than the circle: the highest point is another one.
+    np.testing.assert_allclose(rewards.terrain(stance, below + 0.5, highest, 0.25), [-1, -1, -1, 0])
 
 
 def test_height_step_by_step():

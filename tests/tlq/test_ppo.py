@@ -2,6 +2,8 @@
 
 import dataclasses
 import functools
+import os
+import socket
 import subprocess
 import sys
 
@@ -11,9 +13,12 @@ import numpy as np
 import pytest
 from brax.envs.base import Wrapper
 from brax.envs.wrappers.training import VmapWrapper
+from brax.training.agents.ppo.losses import compute_ppo_loss
+from brax.training.types import Transition
 from jax.sharding import PartitionSpec as P
 
 from tests.tlq.toy import ACTIONS, ToyEnv
+from tlq.loss import LossConfig, ppo_loss
 from tlq.memory import RecurrentWrapper, carry_size
 from tlq.networks import NetworkConfig, make_networks
 from tlq.ppo import AXIS, Learner, PPOConfig, adapt_learning_rate, hoist, make_mesh, summarise
@@ -23,6 +28,7 @@ NETWORKS = NetworkConfig(
 )
 CONFIG = PPOConfig(unroll=12, epochs=1, minibatches=1, kl_target=0, reward_scaling=1.0)
 B = 32
+KEY = jax.random.PRNGKey(0)
 
 
 def make_learner(memory="mingru", config=CONFIG, env=None, devices=1):
@@ -190,26 +196,122 @@ def test_environments_that_cannot_be_split_evenly_are_refused():
         make_learner(config=dataclasses.replace(CONFIG, minibatches=5))
 
 
-def test_two_devices_agree(tmp_path):
-    """The same code on two devices: parameters are one and the same on both, environments are split."""
-    code = """
-import jax, numpy as np
-jax.config.update("jax_num_cpu_devices", 2)
-from tests.tlq.test_ppo import make_learner, B
-learner = make_learner(devices=2)
+COMPARED = """
+import sys, numpy as np, jax
+from tests.tlq.test_ppo import SHARED, make_learner
+learner = make_learner(config=SHARED, devices=0)
 state = learner.init(0)
-for _ in range(2):
+for _ in range(3):
     state, metrics = learner.step(state)
-for x in jax.tree.leaves((state.params, state.opt_state, state.normaliser)):
-    a, b = (np.asarray(s.data) for s in x.addressable_shards)
-    np.testing.assert_array_equal(a, b)
-assert state.env_state.reward.addressable_shards[0].data.shape == (B // 2,)
-keys = state.env_state.pipeline_state["key"].addressable_shards
-assert (np.asarray(keys[0].data) != np.asarray(keys[1].data)).any()
-assert all(np.isfinite(float(x)) for x in metrics.values())
+    metrics = jax.device_get(metrics)
+parts = jax.tree.leaves((state.params, state.opt_state, state.normaliser, state.learning_rate))
+if jax.process_index() == 0:
+    np.savez(sys.argv[1], *map(np.asarray, parts), reward=metrics["reward"], kl=metrics["kl"])
+assert state.env_state.reward.addressable_shards[0].data.shape == (32 // jax.device_count(),)
 """
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=600)
-    assert done.returncode == 0, done.stderr
+SHARED = dataclasses.replace(CONFIG, epochs=2, minibatches=2, entropy=1e-2, kl_target=0.02)
+JOIN = """
+from tlq.cores import join
+join(sys.argv[2], 2, int(sys.argv[3]))
+"""
+
+
+def run_python(code, *arguments):
+    return subprocess.Popen(
+        [sys.executable, "-c", code, *map(str, arguments)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        env=os.environ | {"XLA_FLAGS": "", "PJRT_NPROC": "8"},
+    )
+
+
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory):
+    """Parameters, optimiser, normaliser and figures after three iterations on one device."""
+    path = tmp_path_factory.mktemp("alone") / "one.npz"
+    process = run_python(COMPARED, path)
+    out, _ = process.communicate(timeout=600)
+    assert process.returncode == 0, out
+    return dict(np.load(path))
+
+
+def assert_the_same_update(path, alone):
+    with np.load(path) as found:
+        assert set(found.files) == set(alone)
+        for name, x in alone.items():
+            np.testing.assert_allclose(found[name], x, rtol=2e-3, atol=2e-5, err_msg=name)
+
+
+def test_two_devices_make_the_update_of_one(alone, tmp_path):
+    two = 'import jax; jax.config.update("jax_num_cpu_devices", 2)\n'
+    process = run_python(two + COMPARED, tmp_path / "two.npz")
+    out, _ = process.communicate(timeout=600)
+    assert process.returncode == 0, out
+    assert_the_same_update(tmp_path / "two.npz", alone)
+
+
+def test_two_processes_make_the_update_of_one(alone, tmp_path):
+    """Over loopback, as on two hosts."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{probe.getsockname()[1]}"
+    code = COMPARED.replace("from tests", JOIN + "from tests", 1)
+    processes = [run_python(code, tmp_path / "two.npz", address, i) for i in (0, 1)]
+    outputs = [process.communicate(timeout=600)[0] for process in processes]
+    for process, out in zip(processes, outputs, strict=True):
+        assert process.returncode == 0, out
+    assert_the_same_update(tmp_path / "two.npz", alone)
+
+
+def test_the_loss_is_braxs(learner, trained):
+    """Value and gradient, without the entropy, whose noise is drawn in another way."""
+    state, _ = trained
+    env_state, rollout, _ = rollout_of(learner, state)
+    carry, last = state.env_state.obs["carry"], env_state.obs["privileged_state"]
+    params = jax.tree.map(lambda x: x + 0.01 * jax.random.normal(KEY, x.shape), state.params)
+    settings = dict(entropy=0.0, discount=0.97, gae_lambda=0.9, clip=0.1, value_loss=0.7, reward_scaling=0.3)
+
+    def mine(params):
+        keys = jnp.zeros((B, 2), jnp.uint32)
+        return ppo_loss(
+            params, state.normaliser, rollout, carry, last, keys,
+            networks=learner.networks, config=LossConfig(**settings), axis=AXIS,
+        )  # fmt: skip
+
+    def braxs(params):
+        swapped = lambda x: jnp.swapaxes(x, 0, 1)  # noqa: E731
+        data = Transition(
+            observation=jax.tree.map(swapped, dict(rollout.observation, carry=carry[None])),
+            action=(),
+            reward=swapped(rollout.reward),
+            discount=swapped(1 - rollout.done),
+            next_observation={"privileged_state": last[:, None]},
+            extras={
+                "state_extras": {"truncation": swapped(rollout.truncation)},
+                "policy_extras": {
+                    "raw_action": {"action": swapped(rollout.action)},
+                    "log_prob": swapped(rollout.log_prob),
+                    "distribution_params": {"action": swapped(rollout.parameters)},
+                },
+            },
+        )
+        return compute_ppo_loss(
+            params, state.normaliser, data, KEY, learner.networks, entropy_cost=0.0, discounting=0.97,
+            reward_scaling=0.3, gae_lambda=0.9, clipping_epsilon=0.1, vf_coefficient=0.7,
+        )  # fmt: skip
+
+    shard = jax.shard_map(
+        jax.value_and_grad(mine, has_aux=True), mesh=learner.mesh, in_specs=P(), out_specs=P(), check_vma=False
+    )
+    (loss, parts), grads = jax.jit(shard)(params)
+    (expected, other), expected_grads = jax.jit(jax.value_and_grad(braxs, has_aux=True))(params)
+    assert np.asarray(rollout.truncation).any() and np.asarray(rollout.done - rollout.truncation).any()
+    assert float(loss) == pytest.approx(float(expected), rel=1e-5)
+    for name, brax_name in [("policy", "policy_loss"), ("value", "v_loss"), ("kl", "kl_mean")]:
+        assert float(parts[name]) == pytest.approx(float(other[brax_name]), rel=1e-4, abs=1e-6)
+    for x, y in zip(jax.tree.leaves(grads), jax.tree.leaves(expected_grads), strict=True):
+        np.testing.assert_allclose(x, y, rtol=1e-3, atol=1e-5)
 
 
 class ForBrax(Wrapper):

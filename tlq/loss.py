@@ -1,0 +1,95 @@
+"""The PPO loss, from Brax's parts.
+
+It is Brax's `compute_ppo_loss`, but that advantages are normalised over the batch of all devices and the entropy's noise
+belongs to the environment: an update doesn't depend on how many devices share it, within rounding.
+"""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from brax.training.agents.ppo.losses import PPONetworkParams, compute_gae
+from brax.training.agents.ppo.networks import PPONetworks
+
+
+@dataclasses.dataclass(frozen=True)
+class LossConfig:
+    """Weights of the loss; see `tlq.ppo.PPOConfig`."""
+
+    discount: float
+    gae_lambda: float
+    clip: float
+    entropy: float
+    value_loss: float
+    reward_scaling: float
+
+
+def ppo_loss(
+    params: PPONetworkParams,
+    normaliser: Any,
+    rollout: Any,
+    carry: jax.Array,
+    last: jax.Array,
+    keys: jax.Array,
+    *,
+    networks: PPONetworks,
+    config: LossConfig,
+    axis: str,
+) -> tuple[jax.Array, dict[str, jax.Array]]:
+    """Loss of B environments over T steps, on one device of the mesh axis `axis`; its mean over the axis is the loss.
+
+    Args:
+      params: of policy and critic.
+      normaliser: of the observation.
+      rollout: `tlq.ppo.Rollout`, (T, B, ...).
+      carry: (B, C) from before the first step.
+      last: (B, V) 'privileged_state' after the last step.
+      keys: (B, 2) uint32, for the entropy's noise.
+      networks: policy, critic, distribution.
+      config: weights.
+      axis: name of the mesh axis.
+
+    Returns:
+      The loss (), and its parts.
+    """
+    distribution = networks.parametric_action_distribution
+    parameters = networks.policy_network.apply(
+        normaliser, params.policy, dict(rollout.observation, carry=carry[None])
+    )
+    values = networks.value_network.apply(normaliser, params.value, rollout.observation)
+    last_value = networks.value_network.apply(normaliser, params.value, {"privileged_state": last})
+    targets, advantages = compute_gae(
+        truncation=rollout.truncation,
+        termination=rollout.done * (1 - rollout.truncation),
+        rewards=rollout.reward * config.reward_scaling,
+        values=values,
+        bootstrap_value=last_value,
+        lambda_=config.gae_lambda,
+        discount=config.discount,
+    )
+    mean = jax.lax.pmean(jnp.mean(advantages), axis)
+    deviation = jnp.sqrt(jax.lax.pmean(jnp.mean(jnp.square(advantages - mean)), axis))
+    advantages = (advantages - mean) / (deviation + 1e-8)
+
+    ratio = jnp.exp(distribution.log_prob(parameters, {"action": rollout.action}) - rollout.log_prob)
+    clipped = jnp.clip(ratio, 1 - config.clip, 1 + config.clip)
+    policy_loss = -jnp.mean(jnp.minimum(ratio * advantages, clipped * advantages))
+    value_loss = 0.5 * config.value_loss * jnp.mean(jnp.square(targets - values))
+    by_env = jax.vmap(
+        lambda p, key: distribution.entropy({"action": p}, key), in_axes=(1, 0), out_axes=1
+    )
+    entropy_loss = -config.entropy * jnp.mean(by_env(parameters["action"], keys))
+    total = policy_loss + value_loss + entropy_loss
+
+    new = distribution.create_dist(parameters)
+    kl = jnp.mean(new.kl_divergence(distribution.create_dist({"action": rollout.parameters})))
+    return total, {
+        "total": total,
+        "policy": policy_loss,
+        "value": value_loss,
+        "entropy": entropy_loss,
+        "kl": kl,
+        "std": jnp.mean(new.scale),
+        "std_max": jnp.max(new.scale),
+    }
