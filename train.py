@@ -2,7 +2,7 @@
 
 import sys
 
-from tlq.cores import use_all_cores
+from tlq.cores import join, use_all_cores
 
 use_all_cores()  # before JAX starts
 
@@ -21,9 +21,11 @@ def run(node: DictConfig) -> None:
 
     try:
         config = settings.from_hydra(node, HydraConfig.get().overrides.task)
+        if config.coordinator:
+            join(config.coordinator, config.processes, config.process)
         settings.use_cache(config.cache)
         train(config)
-    except (ValueError, TrainingFailed) as error:
+    except (ValueError, OSError, TrainingFailed) as error:
         cli.fail(error)
 
 

@@ -3,9 +3,9 @@
     python -m benchmarks.breakdown                       # poles at the default settings
     python -m benchmarks.breakdown terrain=flat num_envs=512 json=FILE
 
-Each part is compiled on its own, with the environments split over all devices as in training, and timed in turn with the
-whole iteration; medians are printed. The parts leave a little out and, since the compiler fuses across their borders, don't
-add up exactly: `rest of the environment` is what the environment's step takes beyond physics and look-ups (trajectory
+Each part is compiled on its own, with the environments split over all devices as in training, and timed in turn with
+the whole iteration; medians are printed. The parts leave a little out and, since the compiler fuses across their
+borders, don't add up exactly: `rest of the environment` is what the environment's step takes beyond physics and look-ups (trajectory
 generator, sensors, rewards, reset, observation).
 """
 
@@ -82,7 +82,8 @@ def parts(options: Options) -> dict[str, Callable[[], Any]]:
         """A function of the environments of one device, compiled for all of them, what it closes over passed along."""
         local = jax.tree.map(
             lambda spec, tree: jax.tree.map(
-                lambda x: jax.ShapeDtypeStruct((here, *x.shape[1:]) if spec == P(AXIS) else x.shape, x.dtype), tree
+                lambda x: jax.ShapeDtypeStruct((here, *x.shape[1:]) if spec == P(AXIS) else x.shape, x.dtype),
+                tree,
             ),
             tuple(specs),
             arguments,
@@ -91,9 +92,7 @@ def parts(options: Options) -> dict[str, Callable[[], Any]]:
         constants, pure = hoist(function, *local)
         out = jax.tree.map(lambda _: P(AXIS), jax.eval_shape(function, *local))
         run = jax.jit(
-            jax.shard_map(
-                pure, mesh=learner.mesh, in_specs=(P(), *specs), out_specs=out, check_vma=False
-            )
+            jax.shard_map(pure, mesh=learner.mesh, in_specs=(P(), *specs), out_specs=out, check_vma=False)
         )
         constants = jax.device_put(constants, jax.sharding.NamedSharding(learner.mesh, P()))
         return lambda: run(constants, *arguments)
@@ -109,7 +108,9 @@ def parts(options: Options) -> dict[str, Callable[[], Any]]:
 
     def contacts(episode):
         def one(e):
-            centres = e.qpos[:3] + jnp.concatenate([jnp.asarray(env.core.base_foot)[:, :2], -e.qpos[2] * jnp.ones((4, 1))], 1)
+            centres = e.qpos[:3] + jnp.concatenate(
+                [jnp.asarray(env.core.base_foot)[:, :2], -e.qpos[2] * jnp.ones((4, 1))], 1
+            )
             found = terrains.contact(env.bank, e.terrain, centres, e.floor, config.env.num_planes)
             # Moves on by nothing, which the compiler can't know.
             return e.replace(qpos=e.qpos + 1e-12 * sum(jnp.sum(x) for x in found))
@@ -133,7 +134,10 @@ def parts(options: Options) -> dict[str, Callable[[], Any]]:
                 networks.policy_network.apply(normaliser, params, obs), key
             )
             done = networks.parametric_action_distribution.postprocess(raw)
-            return obs | {"carry": done["carry"], "state": obs["state"] + 1e-12 * jnp.sum(done["action"])}, None
+            return obs | {
+                "carry": done["carry"],
+                "state": obs["state"] + 1e-12 * jnp.sum(done["action"]),
+            }, None
 
         return jax.lax.scan(step, obs, jax.random.split(jax.random.PRNGKey(0), unroll))[0]
 
@@ -152,7 +156,9 @@ def parts(options: Options) -> dict[str, Callable[[], Any]]:
 
         long = lambda x: jnp.broadcast_to(x, (unroll, *x.shape))  # noqa: E731
         seen = {k: long(carried.env_state.obs[k]) for k in (*NORMALISED, "is_first")}
-        parameters = networks.policy_network.apply(carried.normaliser, carried.params.policy, carried.env_state.obs)
+        parameters = networks.policy_network.apply(
+            carried.normaliser, carried.params.policy, carried.env_state.obs
+        )
         raw = networks.parametric_action_distribution.sample_no_postprocessing(parameters, carried.key)
         zero = jnp.zeros((unroll, here))
         return Rollout(
@@ -165,7 +171,10 @@ def parts(options: Options) -> dict[str, Callable[[], Any]]:
             truncation=zero,
         )
 
-    rest = {n: getattr(state, n) for n in ("params", "opt_state", "learning_rate", "normaliser", "key", "iteration")}
+    rest = {
+        n: getattr(state, n)
+        for n in ("params", "opt_state", "learning_rate", "normaliser", "key", "iteration")
+    }
     with mock.patch.object(terrains, "contact", flat_contact):
         on_a_plane = spread(repeated(physics), [P(AXIS)], episodes)
         jax.block_until_ready(on_a_plane())  # traced while the patch holds
@@ -214,7 +223,11 @@ def measure(options: Options) -> dict[str, Any]:
         "share_of_iteration": {k: v / seconds["iteration"] for k, v in seconds.items()},
         "seconds": seconds,
         "settings": dataclasses.asdict(options),
-        "machine": {"devices": len(jax.devices()), "kind": jax.devices()[0].device_kind, "cores": os.cpu_count()},
+        "machine": {
+            "devices": len(jax.devices()),
+            "kind": jax.devices()[0].device_kind,
+            "cores": os.cpu_count(),
+        },
     }
 
 

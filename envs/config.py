@@ -65,9 +65,9 @@ class CurriculumConfig:
     down: float = 0.35
     """A level down below this share."""
     practice: float = 0.5
-    """Share of the episodes that practise footholds: on terrain of any difficulty whose pits are `practice_depth` deep. A
-    misstep there costs the foot-terrain reward but no fall, so there is much to learn from each episode. They don't count
-    for the ladder nor for the figures of training. None where the terrain has no pits."""
+    """Share of the episodes that practise footholds: on terrain of any difficulty whose pits are `practice_depth` deep.
+    A misstep there costs the foot-terrain reward but no fall, so there is much to learn from each episode. They don't
+    count for the ladder nor for the figures of training. None where the terrain has no pits."""
     practice_depth: float = 0.02
     """Depth of the pits in those episodes (m)."""
     revisit: float = 0.2

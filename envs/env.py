@@ -70,8 +70,8 @@ class QuadrupedEnv(Env):
 
     @property
     def privileged_size(self) -> int:
-        """V: the observation, 100 true heights where the policy is blind, and 24 more (see `_privileged`)."""
-        return self.core.observation_size + (0 if self.core.heights else 100) + 24
+        """V: the observation, 100 true heights where the policy is blind, and 40 more (see `_privileged`)."""
+        return self.core.observation_size + (0 if self.core.heights else 100) + 40
 
     def reset(self, key: jax.Array) -> State:
         """A robot standing on the start platform of a random terrain, with a random command.
@@ -273,12 +273,15 @@ class QuadrupedEnv(Env):
     def _privileged(
         self, episode: Episode, state: jax.Array, true: jax.Array, command: jax.Array
     ) -> jax.Array:
-        """The critic's observation: the policy's, 100 heights where it has none, and 24 values it can't know."""
+        """The critic's observation: the policy's, 100 heights where it has none, and 40 values it can't know."""
         r, mirror = episode.randomised, self.core.update_mirror(episode.controller.mirror, command)
         side = jnp.stack([jnp.ones_like(mirror), mirror])
         velocity = tg.frames.turn(-tg.frames.yaw(episode.qpos[3:7]), episode.qvel[:2])
         below = self.core.feet(exact_sensors(episode))[:, 2] - true[:, 0]
         order = jnp.where(mirror > 0, jnp.arange(4), jnp.array([1, 0, 3, 2]))
+        # How much of each circle round a foot is a gap: what the foot is about to earn, put plainly.
+        low = jnp.max(true, axis=1, keepdims=True) - true > self.config.rewards.gap_threshold
+        gaps = jnp.stack([jnp.mean(low[:, r], axis=1) for r in _circles()], axis=1)
         rest = jnp.concatenate(
             [
                 velocity * side,
@@ -301,6 +304,7 @@ class QuadrupedEnv(Env):
                     ]
                 ),
                 episode.controller.stride * side,
+                gaps[order].reshape(-1),
             ]
         )
         parts = [state, rest]
@@ -444,6 +448,12 @@ class QuadrupedEnv(Env):
 
     def _share(self, level: jax.Array) -> jax.Array:
         return level / max(self.levels - 1, 1)
+
+
+def _circles() -> list[slice]:
+    """The points of each circle among a foot's P."""
+    ends = np.cumsum([0, *(count for count, _ in tg.samples.RINGS)])
+    return [slice(a, b) for a, b in zip(ends[:-1], ends[1:], strict=True)]
 
 
 def exact_sensors(episode: Episode) -> tg.Sensors:

@@ -41,7 +41,7 @@ class Episode(flax.struct.PyTreeNode):
     level: jax.Array
     """() int32, level of the ladder that this episode is on."""
     counts: jax.Array
-    """() bool, whether the episode counts for the ladder: not if an easier level is revisited or footholds practised."""
+    """() bool, whether the episode counts for the ladder: not if it revisits an easier level or practises footholds."""
     practice: jax.Array
     """() bool, whether footholds are practised above shallow pits."""
     floor: jax.Array

@@ -13,6 +13,7 @@ from typing import Any
 import jax
 import numpy as np
 import orbax.checkpoint as ocp
+from jax.experimental import multihost_utils
 
 logging.getLogger("absl").setLevel(logging.ERROR)
 
@@ -50,14 +51,17 @@ class Checkpoints:
                 if about["layout"] != _layout(target):
                     raise ValueError(_difference(self.folder / str(step), about["layout"], _layout(target)))
                 leaves = self._read(step, jax.tree.map(_abstract, target))
-                if leaves is not None and _digest(leaves) in ("", about["digest"]):
+                if leaves is not None and _same(about["digest"], _digest(leaves)):
                     return _unflatten(like, leaves), about
             aside = self.folder / f"damaged-{step}"
-            print(
-                f"checkpoint {self.folder / str(step)} is damaged; skipped, and renamed to {aside.name}",
-                flush=True,
-            )
-            (self.folder / str(step)).rename(aside)
+            if jax.process_index() == 0:
+                print(
+                    f"checkpoint {self.folder / str(step)} is damaged; skipped, and renamed to {aside.name}",
+                    flush=True,
+                )
+                (self.folder / str(step)).rename(aside)
+            if jax.process_count() > 1:
+                multihost_utils.sync_global_devices(f"renamed {step}")
             self._manager.reload()
         raise ValueError(f"no readable checkpoint in {self.folder}")
 
@@ -146,6 +150,10 @@ def _digest(leaves: dict[str, Any]) -> str:
         digest.update(name.encode())
         digest.update(np.ascontiguousarray(x).tobytes())
     return digest.hexdigest()
+
+
+def _same(saved: str, found: str) -> bool:
+    return saved == found or "" in (saved, found)
 
 
 def _checksum(about: dict[str, Any]) -> str:

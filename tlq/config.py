@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from tlq.cli import UsageError, unknown
+from tlq.files import whole
 from tlq.networks import NetworkConfig
 from tlq.ppo import PPOConfig
 
@@ -43,6 +44,13 @@ class TrainConfig:
     """Run folder or policy file whose parameters and normaliser to start from."""
     devices: int = 0
     """Devices to use; 0: all of them."""
+    coordinator: str = ""
+    """For training on several hosts: host:port of process 0, the same in every process, or "auto" under Slurm, Open MPI
+    or Kubernetes. Empty: this process alone."""
+    processes: int = 1
+    """Number of processes, with a coordinator's address."""
+    process: int = 0
+    """Number of this process, from 0."""
     checkpoint_every: float = 300.0
     """Seconds between checkpoints."""
     keep: int = 3
@@ -283,6 +291,14 @@ def validate(config: TrainConfig) -> None:
             value = getattr(value, name)
         if value <= 0:
             raise UsageError(f"{key}={value} must be positive")
+    if not 0 <= config.process < config.processes:
+        raise UsageError(f"process={config.process} must be from 0 to processes - 1 = {config.processes - 1}")
+    if config.processes > 1 and config.coordinator in ("", "auto"):
+        raise UsageError(
+            f"processes={config.processes} needs the address of process 0, e.g. coordinator=192.168.0.1:1234"
+        )
+    if config.coordinator and not config.run:
+        raise UsageError("with coordinator= set run=, the same folder in every process")
     if config.num_envs % config.ppo.minibatches:
         raise UsageError(
             f"num_envs={config.num_envs} must be a multiple of ppo.minibatches={config.ppo.minibatches}"
@@ -298,7 +314,10 @@ def save_config(config: TrainConfig, path: Path) -> None:
     """Writes the resolved configuration as YAML."""
     from omegaconf import OmegaConf
 
-    OmegaConf.save(OmegaConf.create(dataclasses.asdict(dataclasses.replace(config, resume=False))), path)
+    with whole(path) as temporary:
+        OmegaConf.save(
+            OmegaConf.create(dataclasses.asdict(dataclasses.replace(config, resume=False))), temporary
+        )
 
 
 def load_config(path: Path) -> TrainConfig:

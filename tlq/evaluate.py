@@ -12,7 +12,6 @@ import json
 import math
 import multiprocessing
 import os
-import tempfile
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -25,6 +24,7 @@ import terrains
 from tlq import judge
 from tlq.cli import find_policy, option, parse, run
 from tlq.config import build
+from tlq.files import whole
 from tlq.runtime import Controller, load_policy
 
 ENGINES = ("mjx", "mujoco")
@@ -268,17 +268,9 @@ def table(result: dict[str, Any]) -> str:
 
 def write_json(path: str | os.PathLike[str], result: Any) -> None:
     """Writes a file whole or not at all."""
-    path = Path(path)
-    handle, name = tempfile.mkstemp(prefix=f".{path.name}-", suffix=".tmp", dir=path.absolute().parent)
-    try:
-        with os.fdopen(handle, "w") as file:
-            json.dump(result, file, indent=2, allow_nan=False)
-            file.write("\n")
-        os.chmod(name, 0o644)
-        os.replace(name, path)
-    except BaseException:
-        os.unlink(name)
-        raise
+    with whole(path) as temporary, temporary.open("w") as file:
+        json.dump(result, file, indent=2, allow_nan=False)
+        file.write("\n")
 
 
 def main(arguments: Sequence[str]) -> None:

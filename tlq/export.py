@@ -17,10 +17,13 @@ from typing import Any
 import numpy as np
 
 from tlq.cli import option, parse, run
+from tlq.files import whole
 from tlq.graph import INPUTS, OUTPUTS, Graph
 from tlq.runtime import FORMAT, VERSION, load_policy
 
 _PARAMS = "params.policy.params."
+PLACE = ("run", "resume", "init", "devices", "cache", "coordinator", "processes", "process")
+"""Settings that say where a run took place, not what it was."""
 _MEAN, _STD = "normaliser.mean.state", "normaliser.std.state"
 
 
@@ -78,17 +81,8 @@ def _save(
     path: Path, nodes: list[dict[str, Any]], arrays: Mapping[str, Any], metadata: dict[str, Any]
 ) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(prefix=f".{path.name}-", suffix=".tmp", dir=path.parent)
-    try:
-        with os.fdopen(handle, "wb") as file:
-            np.savez(file, allow_pickle=False, **_text(graph=nodes, metadata=metadata), **arrays)
-            file.flush()
-            os.fsync(file.fileno())
-        os.chmod(name, 0o644)
-        os.replace(name, path)
-    except BaseException:
-        os.unlink(name)
-        raise
+    with whole(path) as temporary, temporary.open("wb") as file:
+        np.savez(file, allow_pickle=False, **_text(graph=nodes, metadata=metadata), **arrays)
 
 
 def _text(**values: Any) -> dict[str, Any]:
@@ -139,7 +133,7 @@ def describe(config: Any) -> dict[str, Any]:
 def _settings(config: Any) -> dict[str, Any]:
     """The training's settings, without those that say where on a machine it ran."""
     settings = dataclasses.asdict(config)
-    return {k: v for k, v in settings.items() if k not in ("run", "resume", "init", "devices", "cache")}
+    return {k: v for k, v in settings.items() if k not in PLACE}
 
 
 @functools.lru_cache(maxsize=4)

@@ -7,6 +7,8 @@ from pathlib import Path
 
 from tensorboardX import SummaryWriter
 
+from tlq.files import whole
+
 # name in the text line, name of the figure, format
 LINE = (
     ("reward", "reward", ".3f"),
@@ -59,9 +61,10 @@ class Logger:
             return
         with self._path.open(newline="") as file:
             reader = csv.DictReader(file)
-            rows = [row for row in reader if row["iteration"] and float(row["iteration"]) <= iteration]
+            # A row that a killed process left unfinished has no value in its last columns.
+            rows = [row for row in reader if all(row.values()) and float(row["iteration"]) <= iteration]
             self._columns = list(reader.fieldnames or [])
-        with self._path.open("w", newline="") as file:
+        with whole(self._path) as temporary, temporary.open("w", newline="") as file:
             writer = csv.DictWriter(file, self._columns)
             writer.writeheader()
             writer.writerows(rows)
@@ -85,7 +88,8 @@ class Logger:
             axis.grid(alpha=0.3)
         for axis in axes[-1]:
             axis.set_xlabel("million steps")
-        figure.savefig(self.folder / "curve.png", dpi=80)
+        with whole(self.folder / "curve.png") as temporary:
+            figure.savefig(temporary, dpi=80)
         plt.close(figure)
 
     def close(self) -> None:

@@ -1,7 +1,7 @@
 """The PPO loss, from Brax's parts.
 
-It is Brax's `compute_ppo_loss`, but that advantages are normalised over the batch of all devices and the entropy's noise
-belongs to the environment: an update doesn't depend on how many devices share it, within rounding.
+It is Brax's `compute_ppo_loss`, but that advantages are normalised over the batch of all devices and the entropy's
+noise belongs to the environment: an update doesn't depend on how many devices share it, within rounding.
 """
 
 import dataclasses
@@ -76,9 +76,7 @@ def ppo_loss(
     clipped = jnp.clip(ratio, 1 - config.clip, 1 + config.clip)
     policy_loss = -jnp.mean(jnp.minimum(ratio * advantages, clipped * advantages))
     value_loss = 0.5 * config.value_loss * jnp.mean(jnp.square(targets - values))
-    by_env = jax.vmap(
-        lambda p, key: distribution.entropy({"action": p}, key), in_axes=(1, 0), out_axes=1
-    )
+    by_env = jax.vmap(lambda p, key: distribution.entropy({"action": p}, key), in_axes=(1, 0), out_axes=1)
     entropy_loss = -config.entropy * jnp.mean(by_env(parameters["action"], keys))
     total = policy_loss + value_loss + entropy_loss
 

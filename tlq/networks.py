@@ -53,8 +53,8 @@ class NetworkConfig:
     head: int = 64
     """Width of the layer before the action."""
     leg_head: int = 32
-    """Width of the layer that turns what one foot sees into that leg's residuals, its weights shared by the four legs: what
-    one leg learns about an edge, all of them know. 0: none."""
+    """Width of the layer that turns what one foot sees into that leg's residuals, its weights shared by the four legs:
+    what one leg learns about an edge, all of them know. 0: none."""
     leg_context: int = 16
     """Width of what the rest of the network tells each leg's head."""
     critic: tuple[int, ...] = (128, 128)

@@ -28,7 +28,7 @@ from tlq.loss import LossConfig, ppo_loss
 AXIS = "data"
 NORMALISED = ("state", "privileged_state")
 STREAMS = 16
-"""Groups of environments that are shuffled each by itself, so that a minibatch doesn't depend on the number of devices."""
+"""Groups of environments that are shuffled each by itself: a minibatch doesn't depend on the number of devices."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,7 +43,7 @@ class PPOConfig:
     """Gradient steps of a pass; each takes B / minibatches whole pieces of T steps."""
     discount: float = 0.99
     """Discount of a step."""
-    gae_lambda: float = 0.95
+    gae_lambda: float = 0.9
     """Lambda of the advantage estimate."""
     clip: float = 0.2
     """Clipping range of the probability ratio."""
@@ -308,7 +308,9 @@ class Learner:
         size = self.num_envs // self.streams
 
         def order(stream: jax.Array) -> jax.Array:
-            keys = jax.random.split(jax.random.fold_in(key, jax.lax.axis_index(AXIS) * here + stream), c.epochs)
+            keys = jax.random.split(
+                jax.random.fold_in(key, jax.lax.axis_index(AXIS) * here + stream), c.epochs
+            )
             return stream * size + jax.vmap(lambda k: jax.random.permutation(k, size))(keys)
 
         orders = jax.vmap(order)(jnp.arange(here)).reshape(here, c.epochs, c.minibatches, -1)

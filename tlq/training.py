@@ -26,7 +26,7 @@ from tlq.ppo import Learner, TrainState, make_mesh
 
 
 class TrainingFailed(RuntimeError):
-    """An update wasn't finite; the text says what was saved where."""
+    """An update wasn't finite, or a checkpoint couldn't be written; the text says what was saved where."""
 
 
 def wrap(env: Env, config: TrainConfig) -> Env:
@@ -52,7 +52,10 @@ def make_learner(config: TrainConfig, env: Env | None = None, heights: int | Non
 def train(config: TrainConfig, env: Env | None = None, heights: int | None = None) -> dict[str, float]:
     """Runs or resumes a training run in `config.run`; returns the figures of its last iteration."""
     folder = check_folder(config)
-    print(f"run {folder}: building terrain and program, which takes a minute or two", flush=True)
+    first = jax.process_index() == 0
+    _meet("folder checked")  # before process 0 puts something into it
+    if first:
+        print(f"run {folder}: building terrain and program, which takes a minute or two", flush=True)
     learner = make_learner(config, env, heights)
     state = learner.init(config.seed)
     if config.init and not config.resume:
@@ -63,17 +66,24 @@ def train(config: TrainConfig, env: Env | None = None, heights: int | None = Non
     checkpoints = Checkpoints(folder / "checkpoints", config.keep)
     if config.resume:
         state, _ = checkpoints.restore(state)
-    save_config(config, folder / "config.yaml")
-    logger = Logger(folder, config.steps, int(state.iteration), config.log_every)
+    logger = None
+    if first:
+        save_config(config, folder / "config.yaml")
+        logger = Logger(folder, config.steps, int(state.iteration), config.log_every)
     try:
         return _loop(config, learner, state, checkpoints, logger)
     finally:
-        logger.close()
+        if logger:
+            logger.close()
         checkpoints.close()
 
 
 def _loop(
-    config: TrainConfig, learner: Learner, state: TrainState, checkpoints: Checkpoints, logger: Logger
+    config: TrainConfig,
+    learner: Learner,
+    state: TrainState,
+    checkpoints: Checkpoints,
+    logger: Logger | None,
 ) -> dict[str, float]:
     iteration = int(state.iteration)  # a Python int, so that the count of steps can't overflow
     figures: dict[str, float] = {}
@@ -94,7 +104,7 @@ def _loop(
                 "steps_per_second": learner.steps_per_iteration / (time.monotonic() - began),
                 **measured,
             }
-            if jax.process_index() == 0:
+            if logger:
                 logger.write(figures)
             if _agree(time.monotonic() - saved_at > config.checkpoint_every):
                 save(config, learner, state, checkpoints, logger)
@@ -106,19 +116,31 @@ def _loop(
     steps = iteration * learner.steps_per_iteration
     if not figures:
         print(f"{config.run} has its {steps} steps already; set steps= to a larger number to go on")
-    elif stop:
+    elif stop and logger:
         print(f"stopped at {steps} steps; go on with run={config.run} resume=true")
     return figures
 
 
 def save(
-    config: TrainConfig, learner: Learner, state: TrainState, checkpoints: Checkpoints, logger: Logger
+    config: TrainConfig,
+    learner: Learner,
+    state: TrainState,
+    checkpoints: Checkpoints,
+    logger: Logger | None,
 ) -> None:
     """Checkpoint, exported policy and picture of the run so far."""
     iteration = int(state.iteration)
     env_steps = iteration * learner.steps_per_iteration
-    checkpoints.save(iteration, state, {"env_steps": env_steps, "seed": config.seed})
-    if jax.process_index() == 0:
+    before = checkpoints.steps()
+    try:
+        checkpoints.save(iteration, state, {"env_steps": env_steps, "seed": config.seed})
+    except Exception as error:  # a full disk shows as one of many
+        reason = str(error).strip().partition("\n")[0] or type(error).__name__
+        kept = f"checkpoint {before[-1]} is as it was" if before else "nothing was saved before"
+        raise TrainingFailed(
+            f"can't write checkpoint {iteration} in {checkpoints.folder}: {reason}; {kept}"
+        ) from error
+    if logger:
         logger.draw()
         export(config, state, env_steps)
 
@@ -140,7 +162,7 @@ def save_failed(config: TrainConfig, before: TrainState, iteration: int) -> str:
     failed.save(iteration - 1, before, {"seed": config.seed, "iteration": iteration})
     failed.close()
     leaves = zip(names(before.env_state), jax.tree.leaves(before.env_state), strict=True)
-    bad = [n for n, x in leaves if np.issubdtype(x.dtype, np.floating) and not np.isfinite(x).all()]
+    bad = [n for n, x in leaves if np.issubdtype(x.dtype, np.floating) and not bool(jnp.isfinite(x).all())]
     why = f"; not finite before it: {', '.join(bad[:4])}" if bad else ""
     return f"update {iteration} (seed {config.seed}) isn't finite; the state before it is in {place}{why}"
 
@@ -166,6 +188,10 @@ def initialise(state: TrainState, source: str) -> TrainState:
         taken.append(name)
         return jax.device_put(new.astype(x.dtype), x.sharding)
 
+    measured = "normaliser.mean.privileged_state"
+    if measured in arrays and arrays[measured].shape != state.normaliser.mean["privileged_state"].shape:
+        # The critic sees other things than it did: its normaliser is measured anew, see `measure_rest`.
+        arrays = {k: v for k, v in arrays.items() if not k.startswith("normaliser.count")}
     flat = [take(n, x) for n, x in zip(names(parts), jax.tree.leaves(parts), strict=True)]
     parts = jax.tree.unflatten(jax.tree.structure(parts), flat)
     print(f"init: {len(taken)} of {len(flat)} arrays from {source}", flush=True)
@@ -224,6 +250,14 @@ def _stop_on_signals() -> Iterator[list[int]]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def _meet(name: str) -> None:
+    """Waits until all processes have come here."""
+    if jax.process_count() > 1:
+        from jax.experimental import multihost_utils
+
+        multihost_utils.sync_global_devices(name)
 
 
 def _agree(flag: bool) -> bool:

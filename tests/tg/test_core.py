@@ -284,9 +284,7 @@ def test_the_turn_is_the_integrated_yaw_rate(subject):
         turned += rate * core.dt
         np.testing.assert_allclose(state.turn, turned, atol=1e-9)
     for _ in range(100):
-        state, _ = core.act(
-            state, np.zeros(14), level._replace(angular_velocity=np.array([0, 0, 1.0])), LEFT
-        )
+        state, _ = core.act(state, np.zeros(14), level._replace(angular_velocity=np.array([0, 0, 1.0])), LEFT)
     np.testing.assert_allclose(state.turn, turned + 2.0 - 2.0 * np.pi, atol=1e-9)
 
 

@@ -70,7 +70,7 @@ def test_what_users_type():
         ("resume=perhaps", "resume=perhaps isn't true or false"),
         ("env.curriculum.depth=[deep]", "deep"),
         ("num_envs=0", "num_envs=0 must be positive"),
-        ("num_envs=1001", "num_envs=1001 must be a multiple of ppo.minibatches=4"),
+        ("num_envs=1001", "num_envs=1001 must be a multiple of ppo.minibatches=8"),
         ("poles", "'poles' isn't of the form key=value, e.g. terrain=poles"),
         ("run=[", "."),
     ],

@@ -270,13 +270,15 @@ def test_the_loss_is_braxs(learner, trained):
     env_state, rollout, _ = rollout_of(learner, state)
     carry, last = state.env_state.obs["carry"], env_state.obs["privileged_state"]
     params = jax.tree.map(lambda x: x + 0.01 * jax.random.normal(KEY, x.shape), state.params)
-    settings = dict(entropy=0.0, discount=0.97, gae_lambda=0.9, clip=0.1, value_loss=0.7, reward_scaling=0.3)
+    settings = LossConfig(
+        entropy=0.0, discount=0.97, gae_lambda=0.9, clip=0.1, value_loss=0.7, reward_scaling=0.3
+    )
 
     def mine(params):
         keys = jnp.zeros((B, 2), jnp.uint32)
         return ppo_loss(
             params, state.normaliser, rollout, carry, last, keys,
-            networks=learner.networks, config=LossConfig(**settings), axis=AXIS,
+            networks=learner.networks, config=settings, axis=AXIS,
         )  # fmt: skip
 
     def braxs(params):
@@ -302,7 +304,11 @@ def test_the_loss_is_braxs(learner, trained):
         )  # fmt: skip
 
     shard = jax.shard_map(
-        jax.value_and_grad(mine, has_aux=True), mesh=learner.mesh, in_specs=P(), out_specs=P(), check_vma=False
+        jax.value_and_grad(mine, has_aux=True),
+        mesh=learner.mesh,
+        in_specs=P(),
+        out_specs=P(),
+        check_vma=False,
     )
     (loss, parts), grads = jax.jit(shard)(params)
     (expected, other), expected_grads = jax.jit(jax.value_and_grad(braxs, has_aux=True))(params)
