@@ -17,7 +17,8 @@ import terrains
 import tg
 from envs import physics
 from envs.config import METHODS, EnvConfig
-from envs.robot import Robot
+from envs.limits import check_limits
+from envs.robot import ROBOTS, Robot
 from envs.types import Episode, Randomised
 
 GOAL = 5.0
@@ -70,8 +71,8 @@ class QuadrupedEnv(Env):
 
     @property
     def privileged_size(self) -> int:
-        """V: the observation, 100 true heights where the policy is blind, and 40 more (see `_privileged`)."""
-        return self.core.observation_size + (0 if self.core.heights else 100) + 40
+        """V: the observation, 100 true heights where the policy is blind, and 44 more (see `_privileged`)."""
+        return self.core.observation_size + (0 if self.core.heights else 100) + 44
 
     def reset(self, key: jax.Array) -> State:
         """A robot standing on the start platform of a random terrain, with a random command.
@@ -103,7 +104,7 @@ class QuadrupedEnv(Env):
     @property
     def metric_names(self) -> tuple[str, ...]:
         """Names in `state.metrics`."""
-        terms = ("along", "across", "smooth", "energy", "terrain", "height", "yaw", "heading", "tilt")
+        terms = ("along", "across", "smooth", "energy", "terrain", "aim", "height", "yaw", "heading", "tilt")
         ends = ("ended", "distance", "length", "fell", "level", "exploded")
         return (*(f"reward/{t}" for t in terms), *(f"episode/{e}" for e in ends), "speed", "lift", "level")
 
@@ -273,7 +274,7 @@ class QuadrupedEnv(Env):
     def _privileged(
         self, episode: Episode, state: jax.Array, true: jax.Array, command: jax.Array
     ) -> jax.Array:
-        """The critic's observation: the policy's, 100 heights where it has none, and 40 values it can't know."""
+        """The critic's observation: the policy's, 100 heights where it has none, and 44 values it can't know."""
         r, mirror = episode.randomised, self.core.update_mirror(episode.controller.mirror, command)
         side = jnp.stack([jnp.ones_like(mirror), mirror])
         velocity = tg.frames.turn(-tg.frames.yaw(episode.qpos[3:7]), episode.qvel[:2])
@@ -281,7 +282,10 @@ class QuadrupedEnv(Env):
         order = jnp.where(mirror > 0, jnp.arange(4), jnp.array([1, 0, 3, 2]))
         # How much of each circle round a foot is a gap: what the foot is about to earn, put plainly.
         low = jnp.max(true, axis=1, keepdims=True) - true > self.config.rewards.gap_threshold
-        gaps = jnp.stack([jnp.mean(low[:, r], axis=1) for r in _circles()], axis=1)
+        gaps = jnp.stack(
+            [*(jnp.mean(low[:, r], axis=1) for r in _circles()), self._aim(episode, true + episode.qpos[2])],
+            axis=1,
+        )
         rest = jnp.concatenate(
             [
                 velocity * side,
@@ -412,6 +416,7 @@ class QuadrupedEnv(Env):
                     ~swing, below[:, near], jnp.min(below, axis=1), c.gap_threshold, graded=c.terrain_graded
                 )
             ),
+            "aim": jnp.mean(self._aim(after, around)),
             "height": jnp.mean(
                 jnp.where(swing, rewards.height(after.controller.lift, rise, c.lift_threshold), 0.0)
             ),
@@ -419,6 +424,35 @@ class QuadrupedEnv(Env):
             "heading": jnp.cos(tg.frames.yaw(after.qpos[3:7]) - after.heading) - 1.0,
             "tilt": -0.1 * jnp.sum(jnp.square(after.qvel[3:5])),
         }
+
+    def landing_points(self, episode: Episode) -> jax.Array:
+        """Where the feet (L, 2) m in swing will come down, from the trunk's centre, heading frame.
+
+        What is left of the trajectory generator's step, and of the trunk's way at its present velocity; the residual
+        joint angles are taken to stay as they are.
+        """
+        controller = episode.controller
+        phases = tg.path.leg_phases(controller.phase)
+        step = (0.5 - tg.path.stride(phases))[:, None] * (self.core.config.step_length * controller.stride)
+        time_left = jnp.maximum(jnp.pi - phases, 0.0) / (2.0 * jnp.pi * controller.frequency)
+        velocity = tg.frames.turn(-tg.frames.yaw(episode.qpos[3:7]), episode.qvel[:2])
+        feet = self.core.feet(exact_sensors(episode))
+        return feet[:, :2] + step + time_left[:, None] * velocity
+
+    def _aim(self, episode: Episode, around: jax.Array) -> jax.Array:
+        """Minus the share (L,) of low points where a foot in swing will come down; 0 in stance.
+
+        Args:
+          episode: what is judged.
+          around: (L, P) m, terrain heights round the feet, world.
+        """
+        near = self._rings <= self.config.rewards.terrain_ring + 1e-6
+        offsets = jnp.asarray(tg.samples.ring_offsets(), jnp.float32)[np.flatnonzero(near)]
+        there = self._heights(episode, self.landing_points(episode)[:, None] + offsets) + episode.qpos[2]
+        highest = jnp.maximum(jnp.max(around, axis=1), jnp.max(there, axis=1))
+        swing = tg.path.leg_phases(episode.controller.phase) > 0
+        swing &= jnp.sum(jnp.square(episode.command)) > 0.5
+        return rewards.terrain(swing, -there, -highest, self.config.rewards.gap_threshold, graded=True)
 
     def _fell(self, episode: Episode, below: jax.Array, around: jax.Array) -> jax.Array:
         """Whether trunk or a knee hits the terrain, the trunk tilts too far, or a foot is in a gap."""
@@ -465,17 +499,22 @@ def check(config: EnvConfig) -> None:
     """Raises ValueError on a configuration that makes no sense."""
     if config.method not in METHODS:
         raise ValueError(f"unknown method '{config.method}'; choose one of {', '.join(METHODS)}")
+    check_limits(config)
     ratio = config.control_dt / config.physics_dt
     if abs(ratio - round(ratio)) > 1e-6 or ratio < 1:
         raise ValueError(
             f"control_dt={config.control_dt} must be a whole multiple of physics_dt={config.physics_dt}"
         )
-    if config.solver_iterations < 1:
-        raise ValueError(f"solver_iterations={config.solver_iterations} must be at least 1")
     if len(config.curriculum.difficulty) != len(config.curriculum.depth) or not config.curriculum.depth:
         raise ValueError(
             "curriculum.difficulty and curriculum.depth must have the same number of levels, at least 1"
         )
+    if config.terrain.kind not in terrains.kinds():
+        raise ValueError(
+            f"unknown terrain '{config.terrain.kind}'; choose one of {', '.join(terrains.kinds())}"
+        )
+    if not config.robot.file.path and config.robot.name not in ROBOTS:
+        raise ValueError(f"unknown robot '{config.robot.name}'; choose one of {', '.join(sorted(ROBOTS))}")
 
 
 def make_bank(config: EnvConfig) -> terrains.Bank:

@@ -5,7 +5,7 @@ Wide enough for whatever makes sense, narrow enough that what lies within them r
 
 import dataclasses
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 _LENGTH = (0.0, 1.0)
@@ -141,18 +141,24 @@ def leaves(config: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
             yield prefix + field.name, value
 
 
+def check_values(found: Mapping[str, Any], limits: Mapping[str, tuple[float, float]]) -> None:
+    """Raises ValueError where a number, or one of a tuple's, lies outside of its limits."""
+    for name, value in found.items():
+        if name not in limits or value is None:
+            continue
+        low, high = limits[name]
+        for number in _tuple(value):
+            if not (isinstance(number, int | float) and low <= number <= high):
+                raise ValueError(f"{name}={_text(value)} must be from {low:g} to {high:g}")
+
+
 def check_limits(config: Any) -> None:
     """Raises ValueError, which names what is valid, on an `EnvConfig` with a number out of its limits."""
     found = dict(leaves(config))
+    check_values(found, LIMITS)
     for name, value in found.items():
-        if name not in LIMITS or value is None:
-            continue
-        low, high = LIMITS[name]
-        for number in value if isinstance(value, tuple | list) else (value,):
-            if not (isinstance(number, int | float) and low <= number <= high):
-                raise ValueError(f"{name}={_text(value)} must be from {low:g} to {high:g}")
-        is_levels = name.startswith("terrain.") and isinstance(value, tuple) and not name.endswith("widths")
-        if is_levels and len(value) != _LEVELS:
+        sizes = name.startswith("terrain.") and name in LIMITS and isinstance(value, tuple | list)
+        if sizes and not name.endswith("widths") and len(value) != _LEVELS:
             raise ValueError(f"{name}={_text(value)} must be three values: at difficulty 0, at 0.8 and at 1")
     for name in _PAIRS:
         value = found[name]
@@ -161,7 +167,9 @@ def check_limits(config: Any) -> None:
     for smaller, larger in ORDERED:
         pairs = zip(_tuple(found[smaller]), _tuple(found[larger]), strict=True)
         if any(a > b for a, b in pairs):
-            raise ValueError(f"{smaller}={_text(found[smaller])} must not be above {larger}={_text(found[larger])}")
+            raise ValueError(
+                f"{smaller}={_text(found[smaller])} must not be above {larger}={_text(found[larger])}"
+            )
 
 
 def _tuple(value: Any) -> tuple[Any, ...]:

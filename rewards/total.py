@@ -10,7 +10,7 @@ def total(config: RewardConfig, terms: dict[str, jax.Array]) -> tuple[jax.Array,
 
     Args:
       config: weights.
-      terms: `along`, `across`, `smooth`, `energy`, `terrain`, `height`, `yaw`, `heading`, `tilt`, each () and
+      terms: `along`, `across`, `smooth`, `energy`, `terrain`, `aim`, `height`, `yaw`, `heading`, `tilt`, each () and
         unweighted.
 
     Returns:

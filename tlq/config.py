@@ -18,6 +18,43 @@ from tlq.networks import NetworkConfig
 from tlq.ppo import PPOConfig
 
 METHODS = ("ours", "fixed_height", "blind")
+_WIDTH = (1, 4096)
+LIMITS: dict[str, tuple[float, float]] = {
+    "num_envs": (1, 1 << 22),
+    "steps": (1, 10**15),
+    "seed": (0, 2**32 - 1),
+    "devices": (0, 1 << 16),
+    "processes": (1, 1 << 16),
+    "process": (0, 1 << 16),
+    "checkpoint_every": (0.0, 1e9),
+    "keep": (1, 10_000),
+    "log_every": (0.0, 1e9),
+    "policy.memory_layers": (1, 16),
+    "policy.memory_width": _WIDTH,
+    "policy.encoder": _WIDTH,
+    "policy.foot_encoder": _WIDTH,
+    "policy.head": _WIDTH,
+    "policy.leg_head": (0, 4096),
+    "policy.leg_context": _WIDTH,
+    "policy.critic": _WIDTH,
+    "policy.initial_std": (0.01, 10.0),
+    "policy.feet": (4, 4),
+    "ppo.unroll": (1, 10_000),
+    "ppo.epochs": (1, 1000),
+    "ppo.minibatches": (1, 1 << 20),
+    "ppo.discount": (0.0, 1.0),
+    "ppo.gae_lambda": (0.0, 1.0),
+    "ppo.clip": (1e-4, 10.0),
+    "ppo.learning_rate": (1e-9, 1.0),
+    "ppo.learning_rate_min": (1e-9, 1.0),
+    "ppo.learning_rate_max": (1e-9, 1.0),
+    "ppo.kl_target": (0.0, 10.0),
+    "ppo.entropy": (0.0, 10.0),
+    "ppo.value_loss": (0.0, 1e3),
+    "ppo.max_grad_norm": (1e-6, 1e6),
+    "ppo.reward_scaling": (1e-6, 1e6),
+}
+"""Limits of the numbers outside of `env` (those have theirs in `envs.limits`), both ends included."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -196,14 +233,15 @@ def _number(key: str, text: str, kind: type) -> str:
     return text if kind is float or plain else str(int(number))
 
 
-def _try(arguments: Sequence[str]) -> None:
+def _try(arguments: Sequence[str]) -> Any:
+    """What Hydra makes of the arguments."""
     from hydra import compose, initialize_config_dir
     from hydra.errors import HydraException
     from omegaconf.errors import OmegaConfBaseException
 
     try:
         with initialize_config_dir(str(Path(__file__).parent / "conf"), version_base=None):
-            compose("train", list(arguments))
+            return compose("train", list(arguments))
     except (HydraException, OmegaConfBaseException) as error:
         why = str(error.__cause__ or error).partition("\n")[0]
         raise UsageError(f"{why} ({' '.join(arguments)})") from None
@@ -228,7 +266,7 @@ def _resumed(data: dict[str, Any], overrides: Sequence[str]) -> dict[str, Any]:
     path = Path(data["run"]) / "config.yaml"
     if not data["run"] or not path.exists():
         raise UsageError(f"run={data['run']} holds no run to resume")
-    saved = OmegaConf.to_container(OmegaConf.load(path))
+    saved = OmegaConf.to_container(OmegaConf.create(dataclasses.asdict(load_config(path))))
     groups = {"terrain": saved["env"]["terrain"]["kind"], "method": saved["env"]["method"]}
     for override in overrides:
         key, _, value = override.lstrip("+").partition("=")
@@ -277,20 +315,20 @@ def validate(config: TrainConfig) -> None:
 
     if config.policy.memory not in KINDS:
         raise UsageError(unknown("policy.memory", config.policy.memory, KINDS))
-    positive = ("num_envs", "steps", "keep", "policy.memory_layers", "policy.memory_width")
-    for key in (
-        *positive,
-        "ppo.unroll",
-        "ppo.epochs",
-        "ppo.minibatches",
-        "ppo.learning_rate",
-        "policy.initial_std",
-    ):
-        value: Any = config
-        for name in key.split("."):
-            value = getattr(value, name)
-        if value <= 0:
-            raise UsageError(f"{key}={value} must be positive")
+    from envs import env as environment
+    from envs.limits import check_values, leaves
+
+    own = {name: value for name, value in leaves(config) if not name.startswith("env.")}
+    try:
+        check_values(own, LIMITS)
+        if config.env is not None:
+            environment.check(config.env)
+    except ValueError as error:
+        raise UsageError(str(error)) from None
+    if not config.policy.foot_encoder or not config.policy.critic:
+        raise UsageError("policy.foot_encoder and policy.critic need at least one layer each")
+    if config.ppo.learning_rate_min > config.ppo.learning_rate_max:
+        raise UsageError("ppo.learning_rate_min must not be above ppo.learning_rate_max")
     if not 0 <= config.process < config.processes:
         raise UsageError(f"process={config.process} must be from 0 to processes - 1 = {config.processes - 1}")
     if config.processes > 1 and config.coordinator in ("", "auto"):
@@ -321,10 +359,27 @@ def save_config(config: TrainConfig, path: Path) -> None:
 
 
 def load_config(path: Path) -> TrainConfig:
-    """Reads what `save_config` wrote."""
+    """Reads what `save_config` wrote; raises UsageError where it isn't that."""
     from omegaconf import OmegaConf
+    from omegaconf.errors import OmegaConfBaseException
+    from yaml import YAMLError
 
-    return build(TrainConfig, OmegaConf.to_container(OmegaConf.load(path)))
+    try:
+        # Merged into the schema, which gives every value its type.
+        schema = OmegaConf.structured(default_config())
+        _writable(schema)
+        found = OmegaConf.load(path)
+        return build(TrainConfig, OmegaConf.to_container(OmegaConf.merge(schema, found)))
+    except (
+        OmegaConfBaseException,
+        YAMLError,
+        UnicodeDecodeError,
+        UsageError,
+        ValueError,
+        TypeError,
+    ) as error:
+        why = str(error).strip().partition("\n")[0]
+        raise UsageError(f"{path} is damaged, or of another version: {why}") from None
 
 
 def use_cache(folder: str) -> None:

@@ -58,17 +58,21 @@ def train(config: TrainConfig, env: Env | None = None, heights: int | None = Non
         print(f"run {folder}: building terrain and program, which takes a minute or two", flush=True)
     learner = make_learner(config, env, heights)
     state = learner.init(config.seed)
-    if config.init and not config.resume:
+    goes_on = config.resume and has_checkpoint(folder)
+    if config.init and not goes_on:
         state = initialise(state, config.init)
         if not int(state.normaliser.count.lo):
             state = measure_rest(learner, state)
     folder.mkdir(parents=True, exist_ok=True)
-    checkpoints = Checkpoints(folder / "checkpoints", config.keep)
-    if config.resume:
-        state, _ = checkpoints.restore(state)
-    logger = None
     if first:
         save_config(config, folder / "config.yaml")
+    checkpoints = Checkpoints(folder / "checkpoints", config.keep)
+    if goes_on:
+        state, _ = checkpoints.restore(state)
+    elif config.resume and first:
+        print(f"run {folder} was stopped before its first checkpoint; it starts at step 0", flush=True)
+    logger = None
+    if first:
         logger = Logger(folder, config.steps, int(state.iteration), config.log_every)
     try:
         return _loop(config, learner, state, checkpoints, logger)
@@ -219,13 +223,21 @@ def measure_rest(learner: Learner, state: TrainState) -> TrainState:
     return dataclasses.replace(looked, normaliser=normaliser, iteration=state.iteration)
 
 
+def has_checkpoint(folder: Path) -> bool:
+    """Whether a run has a checkpoint, be it damaged; what a killed process was writing is none."""
+    names = [path.name for path in (folder / "checkpoints").glob("*")]
+    return any(name.isdigit() or name.startswith("damaged-") for name in names)
+
+
 def check_folder(config: TrainConfig) -> Path:
     """The run's folder; it must be new, or hold a run if `resume` is set."""
     folder = Path(config.run)
     if config.resume:
         if not (folder / "config.yaml").exists():
             raise ValueError(f"run={folder} holds no run to resume")
-    elif folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+    elif folder.exists() and (
+        not folder.is_dir() or any(not p.name.startswith(".") for p in folder.iterdir())
+    ):
         raise ValueError(
             f"run={folder} exists already; add resume=true to go on with it, or choose another name"
         )

@@ -49,7 +49,7 @@ def test_sizes_are_those_announced(exact):
         name: (size,) for name, size in exact.env.observation_size.items()
     }
     assert exact.env.action_size == 14 and exact.env.dt == 0.02
-    assert exact.env.observation_size == {"state": 188, "privileged_state": 228}
+    assert exact.env.observation_size == {"state": 188, "privileged_state": 232}
 
 
 def test_reset_and_step_agree_on_structure_and_types(noisy):
@@ -426,7 +426,7 @@ def blind(exact):
 
 
 def test_blind_sees_no_heights_but_its_critic_does(exact, blind):
-    assert blind.env.observation_size == {"state": 88, "privileged_state": 228}
+    assert blind.env.observation_size == {"state": 88, "privileged_state": 232}
     assert make_core(blind.config, blind.env.robot).heights is False
     k = exact.find("stairs", 9)
     qpos = standing(exact.env, xy=(0.3, 0.2), z=0.05)
@@ -573,7 +573,7 @@ def test_go1_size_stands_and_walks_with_two_planes_a_foot():
     """One compiled program for both: the second robot, and contact with tread and riser at once."""
     robot = envs.RobotConfig(name="go1_size")
     subject = Subject(config(randomised=False, robot=robot, num_planes=2))
-    assert subject.env.observation_size == {"state": 188, "privileged_state": 228}
+    assert subject.env.observation_size == {"state": 188, "privileged_state": 232}
     floor = subject.env.bank.floor[0]
     state = change(subject.state, qpos=standing(subject.env), command=np.zeros(2), terrain=0, floor=floor)
     for _ in range(40):
