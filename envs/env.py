@@ -428,16 +428,20 @@ class QuadrupedEnv(Env):
     def landing_points(self, episode: Episode) -> jax.Array:
         """Where the feet (L, 2) m in swing will come down, from the trunk's centre, heading frame.
 
-        What is left of the trajectory generator's step, and of the trunk's way at its present velocity; the residual
-        joint angles are taken to stay as they are.
+        The end of the trajectory generator's step, the trunk's way until then at its present velocity, and the displacement by
+        the residual joint angles, which are taken to stay as they are.
         """
-        controller = episode.controller
+        controller, sensors = episode.controller, exact_sensors(episode)
         phases = tg.path.leg_phases(controller.phase)
-        step = (0.5 - tg.path.stride(phases))[:, None] * (self.core.config.step_length * controller.stride)
+        level = tg.frames.heading_from_trunk(tg.frames.up_in_trunk(sensors.orientation))
+        target = self.core.foot_targets(phases, controller.lift * controller.gate, controller.stride, sensors)
+        displacement = (controller.targets[0].reshape(4, 3) - target) @ level.T
+        hips = jnp.asarray(self.core.geometry.hip_position) @ level.T
+        step = hips + self.core.base_foot + displacement
         time_left = jnp.maximum(jnp.pi - phases, 0.0) / (2.0 * jnp.pi * controller.frequency)
         velocity = tg.frames.turn(-tg.frames.yaw(episode.qpos[3:7]), episode.qvel[:2])
-        feet = self.core.feet(exact_sensors(episode))
-        return feet[:, :2] + step + time_left[:, None] * velocity
+        end = 0.5 * self.core.config.step_length * controller.stride
+        return step[:, :2] + end + time_left[:, None] * velocity
 
     def _aim(self, episode: Episode, around: jax.Array) -> jax.Array:
         """Minus the share (L,) of low points where a foot in swing will come down; 0 in stance.

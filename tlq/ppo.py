@@ -53,9 +53,9 @@ class PPOConfig:
     """Lower bound of the adaptive learning rate."""
     learning_rate_max: float = 1e-3
     """Upper bound of the adaptive learning rate."""
-    kl_target: float = 0.02
+    kl_target: float = 0.03
     """KL(old, new) of an iteration that the learning rate is steered to; 0 keeps the learning rate."""
-    entropy: float = 1e-3
+    entropy: float = 0.0
     """Weight of the entropy bonus."""
     value_loss: float = 0.5
     """Weight of the value loss (which has a factor 1/2 of its own)."""
