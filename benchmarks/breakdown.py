@@ -5,8 +5,8 @@
 
 Each part is compiled on its own, with the environments split over all devices as in training, and timed in turn with
 the whole iteration; medians are printed. The parts leave a little out and, since the compiler fuses across their
-borders, don't add up exactly: `rest of the environment` is what the environment's step takes beyond physics and look-ups (trajectory
-generator, sensors, rewards, reset, observation).
+borders, don't add up exactly: `rest of the environment` is what the environment's step takes beyond physics and
+look-ups (trajectory generator, sensors, rewards, reset, observation).
 """
 
 import dataclasses

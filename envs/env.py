@@ -428,8 +428,8 @@ class QuadrupedEnv(Env):
     def landing_points(self, episode: Episode) -> jax.Array:
         """Where the feet (L, 2) m in swing will come down, from the trunk's centre, heading frame.
 
-        The end of the trajectory generator's step, the trunk's way until then at its present velocity, and the displacement by
-        the residual joint angles, which are taken to stay as they are.
+        The end of the trajectory generator's step, the trunk's way until then at its present velocity, and the
+        displacement by the residual joint angles, which are taken to stay as they are.
         """
         controller, sensors = episode.controller, exact_sensors(episode)
         phases = tg.path.leg_phases(controller.phase)

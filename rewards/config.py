@@ -22,8 +22,8 @@ class RewardConfig:
     terrain: float = 2.5
     """Weight of r_terrain (mean over the feet)."""
     aim: float = 2.5
-    """Weight of r_terrain for the feet in swing, where they will come down (mean over the feet). Not in the paper: a foot
-    in stance can't be moved any more, this pays for moving it while it can."""
+    """Weight of r_terrain for the feet in swing, where they will come down (mean over the feet). Not in the paper: a
+    foot in stance can't be moved any more, this pays for moving it while it can."""
     height: float = 1.0
     """Weight of r_height (1/m, mean over the feet)."""
     yaw: float = 0.1

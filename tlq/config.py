@@ -362,7 +362,7 @@ def load_config(path: Path) -> TrainConfig:
     """Reads what `save_config` wrote; raises UsageError where it isn't that."""
     from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
-    from yaml import YAMLError
+    from yaml import YAMLError  # type: ignore[import-untyped]
 
     try:
         # Merged into the schema, which gives every value its type.

@@ -64,8 +64,43 @@ CHOICES = [
     "resume=true",
     "init=x",
 ]
-ODD = ["", "null", "None", "nan", "-inf", "1e999", "[", "[]", "[1", "{a: 1}", "${x}", "${env}", "'", '"', "true",
-       "a,b", "1,2", "0x10", "1_0", "٣", "a=b", "\\", "\n", "\x00", "*", "~", "+1", "--", "é", "[[1]]", "1e-400"]  # fmt: skip
+ODD = [
+    *(
+        "",
+        "null",
+        "None",
+        "nan",
+        "-inf",
+        "1e999",
+        "1e-400",
+        "[",
+        "[]",
+        "[1",
+        "[[1]]",
+        "{a: 1}",
+        "${x}",
+        "${env}",
+    ),
+    *(
+        "'",
+        '"',
+        "true",
+        "a,b",
+        "1,2",
+        "0x10",
+        "1_0",
+        "٣",
+        "a=b",
+        "\\",
+        "\n",
+        "\x00",
+        "*",
+        "~",
+        "+1",
+        "--",
+        "é",
+    ),
+]
 numbers = st.one_of(
     st.integers(-3, 3),
     st.integers(-(2**70), 2**70),
@@ -119,7 +154,7 @@ def test_command_lines():
     assert len(accepted) > 100
 
 
-numeric = {n: x for n, x in {**LIMITS, **{}}.items() if n not in ("terrain.num_terrains", "episode_time")}
+numeric = {n: x for n, x in LIMITS.items() if n not in ("terrain.num_terrains", "episode_time")}
 
 
 @pytest.mark.slow
