@@ -126,7 +126,7 @@ def describe(config: Any) -> dict[str, Any]:
         ],
         "memory": {"kind": config.policy.memory, "size": _memory_size(config.policy)},
         "training": _settings(config),
-        "commit": _commit(),
+        "commit": commit(),
     }
 
 
@@ -154,7 +154,7 @@ def _floats(x: Any) -> Any:
 
 
 @functools.cache
-def _commit() -> str:
+def commit() -> str:
     """Commit of the code, with a + if files were changed since; empty outside a repository."""
     root = Path(__file__).resolve().parents[1]
 

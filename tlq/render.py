@@ -327,6 +327,10 @@ def _add_mark(
     scene.ngeom += 1
 
 
+class RenderError(OSError):
+    """This machine can't render; the text says what to install."""
+
+
 @functools.cache
 def gl_context() -> Callable:
     """The class of off-screen OpenGL contexts that works here: MUJOCO_GL's, else the first of `BACKENDS`."""
@@ -342,7 +346,7 @@ def gl_context() -> Callable:
     for backend in BACKENDS:
         if _works(backend):
             return _load(backend)
-    raise RuntimeError(
+    raise RenderError(
         "no OpenGL to render with: install EGL (Debian: apt-get install libegl1 libgl1-mesa-dri) "
         "or OSMesa (apt-get install libosmesa6), or choose MUJOCO_GL=egl, osmesa or glfw"
     )
@@ -361,6 +365,6 @@ def _load(backend: str) -> Callable:
         return importlib.import_module(f"mujoco.{backend}").GLContext
     except (ImportError, AttributeError, OSError) as error:
         package = {"egl": "libegl1 libgl1-mesa-dri", "osmesa": "libosmesa6"}[backend]
-        raise RuntimeError(
+        raise RenderError(
             f"MUJOCO_GL={backend} doesn't work here (Debian: apt-get install {package})"
         ) from error

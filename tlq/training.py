@@ -20,6 +20,7 @@ from brax.envs.wrappers.training import VmapWrapper
 from tlq import memory
 from tlq.checkpoint import Checkpoints, names, read_arrays
 from tlq.config import TrainConfig, save_config
+from tlq.export import commit
 from tlq.logger import Logger
 from tlq.networks import make_networks
 from tlq.ppo import Learner, TrainState, make_mesh
@@ -163,7 +164,7 @@ def save_failed(config: TrainConfig, before: TrainState, iteration: int) -> str:
     """Saves the whole state before a failed update, from which one `Learner.step` fails again; returns the message."""
     place = Path(config.run) / "failed"
     failed = Checkpoints(place)
-    failed.save(iteration - 1, before, {"seed": config.seed, "iteration": iteration})
+    failed.save(iteration - 1, before, {"seed": config.seed, "iteration": iteration, "commit": commit()})
     failed.close()
     leaves = zip(names(before.env_state), jax.tree.leaves(before.env_state), strict=True)
     bad = [n for n, x in leaves if np.issubdtype(x.dtype, np.floating) and not bool(jnp.isfinite(x).all())]

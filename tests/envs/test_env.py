@@ -509,6 +509,7 @@ def test_each_term_is_logged_by_itself(exact):
         "smooth": c.smooth * paid * np.exp(-0.5 * ((q - previous) ** 2).sum()),
         "energy": -c.energy * np.abs(np.asarray(after.torque) * np.asarray(after.qvel[6:])).sum(),
         "terrain": 0.0,
+        "aim": 0.0,
         "height": -c.height * (high * swing).mean(),
         "yaw": -c.yaw * float(after.qvel[5]) ** 2,
         "heading": -c.heading * (1 - np.cos(float(tg.frames.yaw(after.qpos[3:7]) - after.heading))),
@@ -545,6 +546,55 @@ def test_terrain_term_looks_at_the_feet_in_stance(exact):
     standing_terms = env._reward_terms(episode, change_episode(episode, command=np.zeros(2)), below, around)
     np.testing.assert_allclose(standing_terms["terrain"], -low.mean(), atol=1e-6)  # all feet stand
     assert standing_terms["height"] == 0
+
+
+def test_feet_come_down_where_they_were_said_to(exact):
+    """From the middle of the swing on, within 3 cm of where MuJoCo then has the foot; halfway nearer than at first."""
+    env = exact.env
+    feet = jax.jit(env.landing_points)
+
+    def world(episode, points):
+        return np.asarray(episode.qpos[:2] + tg.frames.turn(tg.frames.yaw(episode.qpos[3:7]), points))
+
+    state = change(exact.state, qpos=standing(env), command=LEFT, terrain=exact.find("blocks", 0))
+    states = [s.pipeline_state for s in exact.rollout(state, 70, scale=0.1)]
+    errors = []
+    for leg in range(4):
+        phases = [float(tg.path.leg_phases(e.controller.phase)[leg]) for e in states]
+        for t in range(25, len(states) - 1):
+            if phases[t] > 0 >= phases[t + 1]:  # comes down at t + 1
+                place = (
+                    exact.kinematics(states[t + 1].qpos).site_xpos[env.robot.foot_site_ids[leg], :2].copy()
+                )
+                said = [
+                    (phases[u], np.linalg.norm(world(states[u], feet(states[u]))[leg] - place))
+                    for u in range(t - 12, t + 1)
+                    if phases[u] > 0
+                ]
+                errors += said
+    assert len(errors) > 40
+    early = [e for p, e in errors if p < 0.4 * np.pi]
+    late = [e for p, e in errors if p > 0.6 * np.pi]
+    assert np.median(late) < 0.02 and np.max(late) < 0.05
+    assert np.median(late) < np.median(early) < 0.06
+
+
+def test_aim_term_looks_where_the_feet_will_come_down(exact):
+    """As r_terrain, but for feet in swing, on the ground at their landing points."""
+    env, k = exact.env, exact.find("poles", 9)
+    terrain, c = exact.terrain(k), exact.config.rewards
+    episode = episode_at(exact, k, standing(env, xy=(1.5, 0.3)), floor=-0.5)
+    _, around = env._terrain_at_feet(episode)
+    rings = np.array(tg.samples.ring_offsets())[:7]
+    where = np.asarray(env.landing_points(episode))[:, None] + rings + np.array([1.5, 0.3])
+    heights = terrains.exact_height(terrain, cell_centres(env.bank, where))
+    highest = np.maximum(np.asarray(around).max(axis=1), heights.max(axis=1))
+    low = (highest[:, None] - heights > c.gap_threshold).mean(axis=1)
+    swing = tg.path.leg_phases(np.asarray(episode.controller.phase)) > 0
+    assert swing.sum() == 2 and 0 < low[swing].mean()
+    np.testing.assert_allclose(env._aim(episode, around), -low * swing, atol=1e-6)
+    stands = change_episode(episode, command=np.zeros(2))
+    np.testing.assert_array_equal(env._aim(stands, around), 0)
 
 
 def test_height_term_grants_what_the_terrain_rises(exact):

@@ -143,6 +143,7 @@ WEIGHTS = {
     "smooth": 0.25,
     "energy": 0.001,
     "terrain": 0.4,
+    "aim": 0.5,
     "height": 2.0,
     "yaw": 0.1,
     "heading": 0.3,
@@ -154,6 +155,7 @@ TERMS = {
     "smooth": 0.6,
     "energy": -100.0,
     "terrain": -0.25,
+    "aim": -0.1,
     "height": -0.02,
     "yaw": -0.3,
     "heading": -0.1,
@@ -174,14 +176,15 @@ def test_total_by_hand():
         "smooth": 0.25 * 0.6 * 0.5,
         "energy": -0.1,
         "terrain": -0.1,
+        "aim": -0.05,
         "height": -0.04,
         "yaw": -0.03,
         "heading": -0.03,
         "tilt": -0.01,
     }
     assert {name: float(value) for name, value in weighted.items()} == pytest.approx(expected, abs=1e-6)
-    # 0.5 + 0.2 + 0.075 - 0.1 - 0.1 - 0.04 - 0.03 - 0.03 - 0.01
-    assert reward == pytest.approx(0.465, abs=1e-6)
+    # 0.5 + 0.2 + 0.075 - 0.1 - 0.1 - 0.05 - 0.04 - 0.03 - 0.03 - 0.01
+    assert reward == pytest.approx(0.415, abs=1e-6)
 
 
 def test_literal_total_adds_the_gentle_terms_as_they_are():

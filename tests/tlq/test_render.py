@@ -21,7 +21,7 @@ drawing = pytest.mark.usefixtures("gl")
 def gl():
     try:
         module.gl_context()
-    except RuntimeError as error:
+    except OSError as error:
         pytest.skip(str(error))
 
 
@@ -140,7 +140,7 @@ def test_without_opengl_one_line_says_what_to_install(monkeypatch):
     monkeypatch.delenv("MUJOCO_GL", raising=False)
     monkeypatch.setattr(module.platform, "system", lambda: "Linux")
     monkeypatch.setattr(module, "_works", lambda backend: False)
-    with pytest.raises(RuntimeError, match="install EGL .*libegl1.*libosmesa6") as error:
+    with pytest.raises(OSError, match="install EGL .*libegl1.*libosmesa6") as error:
         module.gl_context.__wrapped__()
     assert "\n" not in str(error.value)
 

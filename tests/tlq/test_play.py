@@ -1,0 +1,70 @@
+"""Showing a policy: pictures and videos of a walk, and answers to what can't be shown."""
+
+import numpy as np
+import pytest
+
+from tests.tlq.policies import trained
+from tlq import play
+from tlq.render import RenderError
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory):
+    """A policy that leaves walking to the trajectory generator."""
+    small = {"policy.encoder": 8, "policy.head": 8, "policy.memory_width": 4}
+    return trained(spread=0.0, **small).export(tmp_path_factory.mktemp("policy") / "policy.npz")
+
+
+def arguments(file, **settings):
+    given = {"policy": file, "terrain": "flat", "seconds": 0.3, **settings}
+    return [f"{name}={value}" for name, value in given.items()]
+
+
+def test_a_walk_is_recorded_step_by_step(file):
+    options = play.Options(policy=str(file), terrain="flat", seconds=0.5)
+    sim = play.simulation(options)
+    start = sim.data.qpos.copy()
+    record = play.walk(sim, np.pi / 2, options.seconds)
+    assert record.qpos.shape == (26, 19) and not record.fell
+    np.testing.assert_array_equal(record.qpos[0], start)
+    np.testing.assert_array_equal(record.qpos[-1], sim.data.qpos)
+    np.testing.assert_allclose(record.command, [0, 1], atol=1e-12)
+    assert record.distance == pytest.approx((record.qpos[:, 1] - start[1]).max(), abs=0.02)
+
+
+def test_files_are_written(file, tmp_path, capsys):
+    video, picture = tmp_path / "walk.mp4", tmp_path / "walk.png"
+    try:
+        play.main(arguments(file, video=video, picture=picture, moments=2))
+    except RenderError as error:  # no OpenGL here
+        pytest.skip(str(error))
+    assert video.stat().st_size > 1000 and picture.stat().st_size > 1000
+    assert "walked 0." in capsys.readouterr().out
+
+
+def test_without_a_display_the_other_ways_are_named(file, monkeypatch):
+    monkeypatch.setattr(play.sys, "platform", "linux")
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    with pytest.raises(
+        ValueError, match=r"no display; write a file instead: video=FILE.mp4 or picture=FILE.png"
+    ):
+        play.main(arguments(file))
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"terrain": "pole"}, "unknown terrain 'pole'"),
+        ({"difficulty": "hard"}, "unknown difficulty 'hard'"),
+        ({"seed": -1}, "seed=-1 must be 0 or more"),
+        ({"seconds": "nan"}, "seconds=nan must be in"),
+        ({"moments": 0}, "moments=0 must be at least 1"),
+        ({"video": "walk.avi"}, "video=walk.avi must end in .mp4"),
+        ({"picture": "/no/where/a.png"}, "there is no folder /no/where"),
+        ({"policy": "nobody"}, "policy=nobody: no such policy"),
+    ],
+)
+def test_wrong_settings_name_what_is_right(file, settings, message):
+    with pytest.raises(ValueError, match=message):
+        play.main(arguments(file, **settings))
