@@ -25,8 +25,10 @@ def run(node: DictConfig) -> None:
             join(config.coordinator, config.processes, config.process)
         settings.use_cache(config.cache)
         train(config)
-    except (ValueError, OSError, TrainingFailed) as error:
+    except (ValueError, OSError) as error:
         cli.fail(error)
+    except TrainingFailed as error:
+        cli.fail(error, at_once=True)
 
 
 if __name__ == "__main__":

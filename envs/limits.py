@@ -74,6 +74,7 @@ LIMITS: dict[str, tuple[float, float]] = {
     "rewards.smooth": _WEIGHT,
     "rewards.energy": _WEIGHT,
     "rewards.terrain": _WEIGHT,
+    "rewards.aim": _WEIGHT,
     "rewards.height": _WEIGHT,
     "rewards.yaw": _WEIGHT,
     "rewards.heading": _WEIGHT,

@@ -13,6 +13,7 @@ A program's options are a class:
 import dataclasses
 import difflib
 import json
+import os
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -119,7 +120,10 @@ def run(main: Callable[[Sequence[str]], None], arguments: Sequence[str] | None =
         sys.exit(130)
 
 
-def fail(error: Exception) -> NoReturn:
-    """One line and exit code 2."""
+def fail(error: Exception, *, at_once: bool = False) -> NoReturn:
+    """One line and exit code 2; at_once: without waiting for threads that may still want to write to a full disk."""
     print(f"error: {' '.join(str(error).split())}", file=sys.stderr, flush=True)
+    if at_once:
+        sys.stdout.flush()
+        os._exit(2)
     sys.exit(2)

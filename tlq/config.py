@@ -236,22 +236,24 @@ def _number(key: str, text: str, kind: type) -> str:
 def _try(arguments: Sequence[str]) -> Any:
     """What Hydra makes of the arguments."""
     from hydra import compose, initialize_config_dir
-    from hydra.errors import HydraException
-    from omegaconf.errors import OmegaConfBaseException
 
     try:
         with initialize_config_dir(str(Path(__file__).parent / "conf"), version_base=None):
             return compose("train", list(arguments))
-    except (HydraException, OmegaConfBaseException) as error:
-        why = str(error.__cause__ or error).partition("\n")[0]
-        raise UsageError(f"{why} ({' '.join(arguments)})") from None
+    except Exception as error:  # its parser and OmegaConf raise many kinds on nonsense
+        why = str(error.__cause__ or error).strip().partition("\n")[0] or type(error).__name__
+        raise UsageError(f"{why} ({' '.join(map(repr, arguments))})") from None
 
 
 def from_hydra(node: Any, overrides: Sequence[str] = ()) -> TrainConfig:
     """Typed configuration from what Hydra composed; overrides: the command line, needed for `resume`."""
     from omegaconf import OmegaConf
+    from omegaconf.errors import OmegaConfBaseException
 
-    data = OmegaConf.to_container(node, resolve=True)
+    try:
+        data = OmegaConf.to_container(node, resolve=True)
+    except OmegaConfBaseException as error:  # an interpolation that leads nowhere
+        raise UsageError(str(error).strip().partition("\n")[0]) from None
     if data["resume"]:
         data = _resumed(data, overrides)
     config = build(TrainConfig, data)

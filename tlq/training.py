@@ -79,7 +79,8 @@ def train(config: TrainConfig, env: Env | None = None, heights: int | None = Non
         return _loop(config, learner, state, checkpoints, logger)
     finally:
         if logger:
-            logger.close()
+            with contextlib.suppress(OSError):  # a full disk, of which the first error tells
+                logger.close()
         checkpoints.close()
 
 
@@ -140,7 +141,7 @@ def save(
     try:
         checkpoints.save(iteration, state, {"env_steps": env_steps, "seed": config.seed})
     except Exception as error:  # a full disk shows as one of many
-        reason = str(error).strip().partition("\n")[0] or type(error).__name__
+        reason = (str(error).strip().partition("\n")[0] or type(error).__name__)[:200]
         kept = f"checkpoint {before[-1]} is as it was" if before else "nothing was saved before"
         raise TrainingFailed(
             f"can't write checkpoint {iteration} in {checkpoints.folder}: {reason}; {kept}"

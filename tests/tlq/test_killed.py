@@ -75,3 +75,40 @@ def test_killed_ten_times_the_run_is_the_uninterrupted_one(tmp_path):
     assert expected.keys() == found.keys() and int(found["iteration"]) == ITERATIONS
     for name, x in expected.items():
         np.testing.assert_array_equal(x, found[name], err_msg=name)
+
+
+FULL = """
+import resource
+from tlq import cli, training
+save = training.save
+
+def full_after_the_first(config, learner, state, checkpoints, logger):
+    if int(state.iteration) > 1:  # every file that grows beyond a kilobyte meets the end of the disk
+        resource.setrlimit(resource.RLIMIT_FSIZE, (1000, resource.RLIM_INFINITY))
+    save(config, learner, state, checkpoints, logger)
+
+training.save = full_after_the_first
+train = training.train
+
+def answered(*arguments, **settings):
+    try:
+        train(*arguments, **settings)
+    except training.TrainingFailed as error:
+        cli.fail(error, at_once=True)
+
+training.train = answered
+"""
+
+
+@pytest.mark.slow
+def test_a_full_disk_ends_the_run_and_spares_what_was_saved(tmp_path):
+    folder, cache = tmp_path / "run", tmp_path / "cache"
+    code = CODE.replace("training.train(", FULL + "training.train(")
+    command = [sys.executable, "-c", code, str(folder), "3", str(cache), "new"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=600, check=False)
+    assert done.returncode == 2
+    last = done.stderr.strip().splitlines()[-1]
+    assert "error: can't write checkpoint 2" in last and "checkpoint 1 is as it was" in last
+    assert int(read_arrays(folder / "checkpoints")["iteration"]) == 1
+    finished(start(folder, cache, resume=True))
+    assert int(read_arrays(folder / "checkpoints")["iteration"]) == ITERATIONS
