@@ -10,6 +10,7 @@ look-ups (trajectory generator, sensors, rewards, reset, observation).
 """
 
 import dataclasses
+import functools
 import json
 import os
 import statistics
@@ -141,40 +142,20 @@ def parts(options: Options) -> dict[str, Callable[[], Any]]:
 
         return jax.lax.scan(step, obs, jax.random.split(jax.random.PRNGKey(0), unroll))[0]
 
-    def update(env_state, rest):
-        carried = dataclasses_replace(rest, env_state)
-        rollout = fake_rollout(carried)
-        last = env_state.obs["privileged_state"]
-        params, _, _ = learner._update(carried, env_state.obs["carry"], rollout, last, carried.key)
-        return jax.tree.map(lambda x: x[None], params)
-
-    def dataclasses_replace(rest, env_state):
-        return state.replace(**rest, env_state=env_state)
-
-    def fake_rollout(carried):
-        from tlq.ppo import NORMALISED, Rollout
-
-        long = lambda x: jnp.broadcast_to(x, (unroll, *x.shape))  # noqa: E731
-        seen = {k: long(carried.env_state.obs[k]) for k in (*NORMALISED, "is_first")}
-        parameters = networks.policy_network.apply(
-            carried.normaliser, carried.params.policy, carried.env_state.obs
+    shard = functools.partial(jax.shard_map, mesh=learner.mesh, check_vma=False)
+    roll = shard(
+        learner._rollout, in_specs=(P(), learner.specs, P()), out_specs=(P(AXIS), P(None, AXIS), P())
+    )
+    env_state, rollout, _ = jax.jit(roll)(learner._step_constants, state, state.key)
+    carry, last = obs["carry"], env_state.obs["privileged_state"]
+    update = jax.jit(
+        shard(
+            learner._update,
+            in_specs=(learner.specs, P(AXIS), P(None, AXIS), P(AXIS), P()),
+            out_specs=P(),
         )
-        raw = networks.parametric_action_distribution.sample_no_postprocessing(parameters, carried.key)
-        zero = jnp.zeros((unroll, here))
-        return Rollout(
-            observation=seen,
-            action=long(raw["action"]),
-            log_prob=long(networks.parametric_action_distribution.log_prob(parameters, raw)),
-            parameters=long(parameters["action"]),
-            reward=zero + 1.0,
-            done=zero,
-            truncation=zero,
-        )
+    )
 
-    rest = {
-        n: getattr(state, n)
-        for n in ("params", "opt_state", "learning_rate", "normaliser", "key", "iteration")
-    }
     with mock.patch.object(terrains, "contact", flat_contact):
         on_a_plane = spread(repeated(physics), [P(AXIS)], episodes)
         jax.block_until_ready(on_a_plane())  # traced while the patch holds
@@ -185,7 +166,7 @@ def parts(options: Options) -> dict[str, Callable[[], Any]]:
         "contact look-ups": spread(repeated(contacts, unroll * env.substeps), [P(AXIS)], episodes),
         "height look-ups": spread(repeated(heights, unroll * HEIGHT_LOOK_UPS), [P(AXIS)], episodes),
         "policy": spread(policy, [P(AXIS), P(), P()], obs, state.params.policy, state.normaliser),
-        "update": spread(update, [P(AXIS), P()], state.env_state, rest),
+        "update": lambda: update(state, carry, rollout, last, state.key),
     }
 
 
