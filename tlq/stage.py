@@ -19,6 +19,8 @@ from tlq.simulation import Simulation
 HIGH, LOW = np.array([250, 205, 60]), np.array([40, 50, 130])
 """Colours of a sample point as high as the highest of the P x L, and of one `tg.core.HEIGHT_CLIP` or more below it."""
 PATH_COLOUR, FOOT_COLOUR = (120, 120, 130), (255, 255, 255)
+DIMMED = 0.62
+"""Of the ground's colours, which are meant for MuJoCo's light and would be white in viser's."""
 FOLLOWING = 0.15
 """Share of the way to the robot that the view makes with each picture."""
 JUMP = 1.0
@@ -40,7 +42,7 @@ class Stage:
         self._built: list[Any] = []
         self._bodies: dict[int, Any] = {}
         self._marks = _add_marks(self.scene)
-        server.initial_camera.position = (1.3, -1.6, 1.0)
+        server.initial_camera.position = (0.9, -1.2, 0.75)
         server.initial_camera.look_at = (0.0, 0.0, 0.25)
 
     def build(self, sim: Simulation) -> None:
@@ -171,7 +173,7 @@ def _add_terrain(scene: Any, model: mujoco.MjModel, floor: float) -> list[Any]:
                 model.geom_quat[rows],
                 model.geom_pos[rows],
                 batched_scales=scales,
-                batched_colors=(255 * model.geom_rgba[rows, :3]).astype(np.uint8),
+                batched_colors=(255 * DIMMED * model.geom_rgba[rows, :3]).astype(np.uint8),
                 lod="off",
                 flat_shading=True,
                 # Shadows of thousands of poles would cost more than all the rest.
@@ -189,9 +191,9 @@ def _add_floor(scene: Any, floor: float) -> Any:
         height=40.0,
         # Below the tops of boxes that are as high as the floor, which would flicker.
         position=(0.0, 0.0, floor - 0.002),
-        cell_color=(90, 98, 110) if pit else (175, 165, 150),
-        section_color=(80, 88, 100) if pit else (150, 140, 125),
-        plane_color=(70, 78, 92) if pit else (205, 195, 175),
+        cell_color=(64, 70, 82) if pit else (130, 122, 110),
+        section_color=(60, 66, 78) if pit else (115, 108, 96),
+        plane_color=(52, 58, 70) if pit else (150, 142, 128),
         plane_opacity=1.0,
     )
 

@@ -251,7 +251,7 @@ class Page:
         with panel.add_tab("Figures"):
             self._table = self.gui.add_markdown("")
             empty = np.zeros(1)
-            series = viser.uplot.Series
+            series, seconds = viser.uplot.Series, {"x": viser.uplot.Scale(time=False)}
             self._tg_plot = self.gui.add_uplot(
                 (empty, empty, empty),
                 (
@@ -260,6 +260,7 @@ class Page:
                     series(label="mean δh, cm", stroke="#f27d1a", width=1.5),
                 ),
                 title="trajectory generator",
+                scales=seconds,
                 aspect=1.7,
             )
             self._reward_plot = self.gui.add_uplot(
@@ -270,6 +271,7 @@ class Page:
                     series(label="reward", stroke="#a64ac9", width=1.5),
                 ),
                 title="along the command",
+                scales=seconds,
                 aspect=1.7,
             )
         panel.dock_left()

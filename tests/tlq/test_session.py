@@ -119,7 +119,7 @@ def test_another_policy_goes_on_where_the_first_was(flat, file, other):
     run(flat, 20)
     state, qpos = flat.sim.controller.state, flat.sim.data.qpos.copy()
     flat.load(str(other))
-    assert flat.sim.controller.memory.shape == (6,) and flat.path == other
+    assert flat.sim.controller.memory.shape == (2 * 6,) and flat.path == other
     assert flat.sim.controller.state is state
     np.testing.assert_array_equal(flat.sim.data.qpos, qpos)
     run(flat, 20)
@@ -147,7 +147,7 @@ def test_a_newer_file_is_taken_over_and_a_damaged_one_named_once(file, other, tm
     session = Session(str(path), "flat")
     assert not session.refresh()
     newer(other, path)
-    assert session.refresh() and session.sim.controller.memory.shape == (6,)
+    assert session.refresh() and session.sim.controller.memory.shape == (2 * 6,)
     path.write_bytes(path.read_bytes()[:1000])
     with pytest.raises(ValueError, match="policy.npz: damaged"):
         session.refresh()
@@ -156,7 +156,7 @@ def test_a_newer_file_is_taken_over_and_a_damaged_one_named_once(file, other, tm
     path.unlink()
     assert not session.refresh()
     newer(file, path)
-    assert session.refresh() and session.sim.controller.memory.shape == (4,)
+    assert session.refresh() and session.sim.controller.memory.shape == (2 * 4,)
 
 
 def test_a_clip_is_what_happened(flat, tmp_path):
