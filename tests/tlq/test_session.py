@@ -122,7 +122,7 @@ def test_another_policy_goes_on_where_the_first_was(flat, file, other):
     assert flat.sim.controller.memory.shape == (2 * 6,) and flat.path == other
     assert flat.sim.controller.state is state
     np.testing.assert_array_equal(flat.sim.data.qpos, qpos)
-    run(flat, 20)
+    run(flat, 60)
     assert flat.sim.data.qpos[0] > qpos[0] and flat.falls == 0
     with pytest.raises(ValueError, match="policy=nobody: no such policy"):
         flat.load("nobody")
