@@ -1,6 +1,7 @@
 """Shows a policy walking in MuJoCo C, on the terrain's true geometry.
 
-python -m tlq.play policy=poles terrain=poles                 # MuJoCo's viewer; needs a display
+python -m tlq.play policy=poles terrain=poles                 # a page for the browser; needs pip install 'tlq[play]'
+python -m tlq.play policy=poles terrain=poles viewer=native   # MuJoCo's viewer; needs a display
 python -m tlq.play policy=poles terrain=poles video=walk.mp4  # a video; needs EGL or OSMesa
 python -m tlq.play policy=poles terrain=poles picture=walk.png  # a strip of moments
 """
@@ -17,12 +18,15 @@ from typing import Any
 import numpy as np
 
 import terrains
-from tlq import render
+from tlq import render, viewer
 from tlq.cli import find_policy, option, parse, run
 from tlq.evaluate import FIRST_SEED, training_env
 from tlq.judge import GOAL
 from tlq.runtime import Controller, load_policy
+from tlq.session import Session
 from tlq.simulation import Simulation
+
+VIEWERS = ("browser", "native")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,6 +44,8 @@ class Options:
     video: str = option("", "MP4 file to write")
     picture: str = option("", "PNG file to write: a strip of moments")
     moments: int = option(6, "pictures in the strip")
+    viewer: str = option("browser", "a page, or MuJoCo's window", choices=lambda: VIEWERS)
+    port: int = option(8080, "of the page")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -89,22 +95,37 @@ def watch(sim: Simulation, direction: float) -> None:
     import mujoco.viewer
 
     command = np.array([math.cos(direction), math.sin(direction)])
-    with mujoco.viewer.launch_passive(sim.model, sim.data) as viewer:
-        while viewer.is_running():
+    with mujoco.viewer.launch_passive(sim.model, sim.data) as window:
+        while window.is_running():
             began = time.monotonic()
             if sim.step(command).fell or np.abs(sim.data.qpos[:2]).max() > GOAL:
                 sim.reset()
-            viewer.sync()
+            window.sync()
             time.sleep(max(sim.controller.control_dt - (time.monotonic() - began), 0.0))
+
+
+def browse(options: Options) -> None:
+    """Serves a page on which the robot can be led about, until it is interrupted."""
+    session = Session(options.policy, options.terrain, options.difficulty, options.seed)
+    session.walk(math.radians(options.direction))
+    viewer.serve(session, options.port)
+
+
+def shown(options: Options) -> bool:
+    """Whether the walk is shown rather than written to files."""
+    return not options.video and not options.picture
 
 
 def main(arguments: Sequence[str]) -> None:
     """The command line."""
     options = parse(Options, arguments, __doc__ or "")
     check(options)
-    sim = simulation(options)
     direction = math.radians(options.direction)
-    if not options.video and not options.picture:
+    if shown(options) and options.viewer == "browser":
+        browse(options)
+        return
+    sim = simulation(options)
+    if shown(options):
         watch(sim, direction)
         return
     record = walk(sim, direction, options.seconds)
@@ -144,6 +165,10 @@ def check(options: Options) -> None:
             raise ValueError(f"{name}={value} must end in {ending}")
         if value and not Path(value).absolute().parent.is_dir():
             raise ValueError(f"{name}={value}: there is no folder {Path(value).absolute().parent}")
+    find_policy(options.policy)
+    if shown(options) and options.viewer == "browser":
+        viewer.load_viser()
+        viewer.check_port(options.port)
 
 
 if __name__ == "__main__":

@@ -90,6 +90,15 @@ class Simulation:
             fell=np.asarray(self.fell()),
         )
 
+    def sensors(self) -> tg.Sensors:
+        """What the robot would measure without errors."""
+        return tg.Sensors(
+            orientation=self.data.qpos[3:7].copy(),
+            angular_velocity=self.data.qvel[3:6].copy(),
+            joint_position=self.data.qpos[self._q],
+            joint_velocity=self.data.qvel[self._v],
+        )
+
     @property
     def yaw(self) -> float:
         """Heading of the trunk (rad)."""
@@ -118,19 +127,13 @@ class Simulation:
 
     def _look(self) -> None:
         """Reads sensors, and the terrain at the feet: as it is, and as it is perceived."""
-        data, core = self.data, self.controller.core
-        exact = {
-            "orientation": data.qpos[3:7].copy(),
-            "angular_velocity": data.qvel[3:6].copy(),
-            "joint_position": data.qpos[self._q],
-            "joint_velocity": data.qvel[self._v],
-        }
-        self._feet = core.feet(tg.Sensors(**exact))
+        data, core, exact = self.data, self.controller.core, self.sensors()
+        self._feet = core.feet(exact)
         points = core.sample_points(self._feet)
         self._ground = self._height(points)
-        self._sensors, self._heights = exact, self._ground - data.qpos[2]
+        self._sensors, self._heights = exact._asdict(), self._ground - data.qpos[2]
         if self.noise is not None:
-            self._sensors = noisy(exact, self.noise, self._random)
+            self._sensors = noisy(self._sensors, self.noise, self._random)
             points = self.controller.sample_points(self._sensors) + self._offset[:2]
             error = self.noise.height_noise * self._random.standard_normal(points.shape[:-1])
             self._heights = self._height(points) - data.qpos[2] + self._offset[2] + error

@@ -1,5 +1,8 @@
 """Showing a policy: pictures and videos of a walk, and answers to what can't be shown."""
 
+import socket
+import sys
+
 import numpy as np
 import pytest
 
@@ -49,6 +52,18 @@ def test_without_a_display_the_other_ways_are_named(file, monkeypatch):
     with pytest.raises(
         ValueError, match=r"no display; write a file instead: video=FILE.mp4 or picture=FILE.png"
     ):
+        play.main(arguments(file, viewer="native"))
+
+
+def test_a_page_that_cannot_be_served_is_said_before_anything_takes_long(file, monkeypatch):
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        with pytest.raises(ValueError, match=f"port={port} is in use; choose another one"):
+            play.main(arguments(file, port=port))
+    monkeypatch.setitem(sys.modules, "viser", None)
+    with pytest.raises(ValueError, match=r"needs viser: pip install 'tlq\[play\]'"):
         play.main(arguments(file))
 
 
@@ -62,6 +77,9 @@ def test_without_a_display_the_other_ways_are_named(file, monkeypatch):
         ({"moments": 0}, "moments=0 must be at least 1"),
         ({"video": "walk.avi"}, "video=walk.avi must end in .mp4"),
         ({"picture": "/no/where/a.png"}, "there is no folder /no/where"),
+        ({"viewer": "window"}, "unknown viewer 'window'; choose one of browser, native"),
+        ({"port": 0}, r"port=0 must be in \[1, 65535\]"),
+        ({"port": 65536}, r"port=65536 must be in \[1, 65535\]"),
         ({"policy": "nobody"}, "policy=nobody: no such policy"),
     ],
 )

@@ -1,0 +1,130 @@
+"""What a robot in a simulation sees, wants and earns: sample points, paths of the feet, reward terms.
+
+World frame, SI units. Letters: L = 4 legs (LF, RF, LR, RR), P = 25 sample points a foot.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import rewards
+import tg
+from tlq.simulation import Simulation
+
+_RINGS = np.array([radius for count, radius in tg.samples.RINGS for _ in range(count)])
+"""Distances (P,) of the sample points from their foot (m)."""
+
+
+def sample_points(sim: Simulation) -> np.ndarray:
+    """The terrain's points (L, P, 3) m that the policy sees."""
+    core = sim.controller.core
+    flat = core.sample_points(core.feet(sim.sensors()))
+    flat = sim.data.qpos[:2] + tg.frames.turn(np.asarray(sim.yaw), flat)
+    return np.concatenate([flat, sim.moment().ground[..., None]], axis=-1)
+
+
+def feet(sim: Simulation) -> np.ndarray:
+    """Where the feet's centres (L, 3) m are."""
+    geometry = sim.controller.core.geometry
+    return _world(sim, tg.leg.forward(geometry, sim.sensors().joint_position.reshape(4, 3)))
+
+
+def desired_feet(sim: Simulation) -> np.ndarray:
+    """Where the last step wanted the feet's centres (L, 3) m: trajectory generator and residual joint angles.
+
+    The joints' share of the weight isn't in it: it is there so that a foot gets where it is wanted.
+    """
+    return _world(sim, sim.controller.state.targets[0].reshape(4, 3))
+
+
+def foot_paths(sim: Simulation, count: int = 24) -> np.ndarray:
+    """The closed paths (L, count, 3) m that the trajectory generator would lead the feet along, as it is set now."""
+    core, state, sensors = sim.controller.core, sim.controller.state, sim.sensors()
+    lift = state.lift * state.gate
+    phases = np.linspace(-np.pi, np.pi, count, dtype=np.float32)
+    targets = [core.foot_targets(np.full(4, p), lift, state.stride, sensors) for p in phases]
+    return _world(sim, np.stack(targets)).swapaxes(0, 1)
+
+
+def _world(sim: Simulation, targets: np.ndarray) -> np.ndarray:
+    """Points (..., L, 3) m from the abduction joints, trunk frame, in the world."""
+    rotation = tg.frames.rotation(sim.data.qpos[3:7])
+    return sim.data.qpos[:3] + (sim.controller.core.geometry.hip_position + targets) @ rotation.T
+
+
+class RewardMeter:
+    """The reward that training would give for each control step, term by term, weighted.
+
+    Two differences from `QuadrupedEnv`: `energy` is the mean power over the step, not that of its last moment, and
+    `aim` is left out, since it needs the state of a training episode.
+    """
+
+    def __init__(self, sim: Simulation):
+        self.reset(sim)
+        self(sim, np.zeros(2), 0.0)  # compiles, so that the first step isn't late
+
+    def reset(self, sim: Simulation) -> None:
+        """To be called when the robot starts anew."""
+        self._lift_off = sim.moment().ground[:, 0]
+        self._desired = sim.controller.state.desired
+        self._heading = sim.yaw
+
+    def __call__(self, sim: Simulation, command: np.ndarray, work: float) -> dict[str, float]:
+        """What the last control step earned.
+
+        Args:
+          sim: after the step.
+          command: (2,) unit vector in the world, or 0 to stand.
+          work: sum of |torque x speed| over the step (J).
+        """
+        state, moment = sim.controller.state, sim.moment()
+        self._lift_off = np.where(moment.phases > 0, self._lift_off, moment.ground[:, 0])
+        measured = {
+            "velocity": sim.data.qvel[:3],
+            "turning": sim.data.qvel[3:6],
+            "command": command,
+            "desired": state.desired,
+            "previous": self._desired,
+            "power": work / sim.controller.control_dt,
+            "phases": moment.phases,
+            "lift": state.lift,
+            "rise": np.maximum(moment.ground.max(axis=1) - self._lift_off, 0.0),
+            "below": moment.feet[:, None] - moment.ground,
+            "drift": sim.yaw - self._heading,
+        }
+        self._desired = state.desired
+        return {
+            name: float(value)
+            for name, value in jax.device_get(_compiled(sim.config.rewards, measured)).items()
+        }
+
+
+def weighted_terms(config: rewards.RewardConfig, measured: dict[str, jax.Array]) -> dict[str, jax.Array]:
+    """Each term () as it enters the reward, and their `total`; `measured` as in `RewardMeter`."""
+    m, c = measured, config
+    velocity, command = m["velocity"][:2], m["command"]
+    walking = jnp.sum(jnp.square(command)) > 0.5
+    swing = (m["phases"] > 0) & walking
+    near = np.flatnonzero(_RINGS <= c.terrain_ring + 1e-6)
+    along = rewards.along(velocity @ command, c.speed_low, c.speed_high, literal=c.literal)
+    gaps = rewards.terrain(
+        ~swing, m["below"][:, near], jnp.min(m["below"], axis=1), c.gap_threshold, graded=c.terrain_graded
+    )
+    lifted = rewards.height(m["lift"], m["rise"], c.lift_threshold)
+    terms = {
+        "along": jnp.where(walking, along, rewards.standing(velocity, c.speed_low)),
+        "across": rewards.across(velocity, command),
+        "smooth": rewards.smooth(m["desired"], m["previous"]),
+        "energy": -m["power"],
+        "terrain": jnp.mean(gaps),
+        "height": jnp.mean(jnp.where(swing, lifted, 0.0)),
+        "yaw": -jnp.square(m["turning"][2]),
+        "heading": jnp.cos(m["drift"]) - 1.0,
+        "tilt": -0.1 * jnp.sum(jnp.square(m["turning"][:2])),
+    }
+    total, weighted = rewards.total(c, terms)
+    return weighted | {"total": total}
+
+
+_compiled = jax.jit(weighted_terms, static_argnums=0)
+"""Once for each configuration: op by op it would cost as much as the simulation."""
