@@ -150,7 +150,7 @@ def check_values(found: Mapping[str, Any], limits: Mapping[str, tuple[float, flo
         low, high = limits[name]
         for number in _tuple(value):
             if not (isinstance(number, int | float) and low <= number <= high):
-                raise ValueError(f"{name}={_text(value)} must be from {low:g} to {high:g}")
+                raise ValueError(f"{name}={_text(value)} must be from {_end(low)} to {_end(high)}")
 
 
 def check_limits(config: Any) -> None:
@@ -175,6 +175,10 @@ def check_limits(config: Any) -> None:
 
 def _tuple(value: Any) -> tuple[Any, ...]:
     return tuple(value) if isinstance(value, tuple | list) else (value,)
+
+
+def _end(limit: float) -> str:
+    return str(limit) if isinstance(limit, int) else f"{limit:g}"
 
 
 def _text(value: Any) -> str:

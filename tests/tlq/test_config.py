@@ -43,7 +43,12 @@ def test_what_users_type():
     assert (config.env.terrain.kind, config.env.method) == ("poles", "blind")
     assert (config.steps, config.num_envs, config.seed, config.ppo.entropy) == (2_000_000, 1024, 3, 0.005)
     assert config.run.startswith("runs/poles-blind-20")
-    nested = parse("env.curriculum.depth=[0.1,0.2]", "env.terrain.stairs.fixed_rise=0.1", "policy.critic=[8]")
+    nested = parse(
+        "env.curriculum.depth=[0.1,0.2]",
+        "env.curriculum.difficulty=[0,1]",
+        "env.terrain.stairs.fixed_rise=0.1",
+        "policy.critic=[8]",
+    )
     assert nested.env.curriculum.depth == (0.1, 0.2)
     assert nested.env.terrain.stairs.fixed_rise == 0.1
     assert nested.policy.critic == (8,)
@@ -69,7 +74,7 @@ def test_what_users_type():
         ("ppo.clip=wide", "ppo.clip=wide isn't a number"),
         ("resume=perhaps", "resume=perhaps isn't true or false"),
         ("env.curriculum.depth=[deep]", "deep"),
-        ("num_envs=0", "num_envs=0 must be positive"),
+        ("num_envs=0", "num_envs=0 must be from 1 to 4194304"),
         ("num_envs=1001", "num_envs=1001 must be a multiple of ppo.minibatches=8"),
         ("poles", "'poles' isn't of the form key=value, e.g. terrain=poles"),
         ("run=[", "."),
