@@ -6,16 +6,12 @@
 Each part is compiled on its own, with the environments split over all devices as in training, and timed in turn with
 the whole iteration; medians are printed. The parts leave a little out and, since the compiler fuses across their
 borders, don't add up exactly: `rest of the environment` is what the environment's step takes beyond physics and
-look-ups (trajectory generator, sensors, rewards, reset, observation).
+look-ups (trajectory generator, sensors, rewards, reset, observation, landing points).
 """
 
 import dataclasses
 import functools
-import json
-import os
-import statistics
 import sys
-import time
 from collections.abc import Callable, Sequence
 from typing import Any
 from unittest import mock
@@ -28,11 +24,19 @@ import jax  # noqa: E402
 import jax.numpy as jnp  # noqa: E402
 from jax.sharding import PartitionSpec as P  # noqa: E402
 
+import envs  # noqa: E402
 import terrains  # noqa: E402
+from benchmarks import timing  # noqa: E402
+from envs.env import exact_sensors  # noqa: E402
 from tlq import cli  # noqa: E402
 from tlq import config as settings  # noqa: E402
 from tlq.ppo import AXIS, hoist  # noqa: E402
 from tlq.training import make_learner  # noqa: E402
+
+HEIGHT_LOOK_UPS = 3
+"""Look-ups of 100 heights in a step: for the reward, for the policy (drifted) and for the critic (exact)."""
+NOTHING = 1e-12
+"""Makes a result part of what the next round starts from, so that the compiler can't leave a round out."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,19 +52,6 @@ class Options:
     json: str = cli.option("", "file for the result")
 
 
-def make_config(options: Options) -> settings.TrainConfig:
-    """Default training with the options' changes."""
-    config = settings.default_config()
-    for key, value in {
-        "env.terrain.kind": options.terrain,
-        "env.terrain.num_terrains": options.num_terrains,
-        "num_envs": options.num_envs,
-        "ppo.unroll": options.unroll,
-    }.items():
-        config = settings.replace(config, key, value)
-    return config
-
-
 def flat_contact(bank: Any, k: Any, centres: jax.Array, floor: Any, num_planes: int) -> tuple[jax.Array, ...]:
     """In place of `terrains.contact`: the plane z = 0 below foot centres (..., 3)."""
     shape = (*centres.shape[:-1], num_planes)
@@ -69,131 +60,109 @@ def flat_contact(bank: Any, k: Any, centres: jax.Array, floor: Any, num_planes: 
     return jnp.broadcast_to(centres[..., None, 2], shape), normal, point
 
 
-def parts(options: Options) -> dict[str, Callable[[], Any]]:
-    """Functions without argument, by name, that run one part of an iteration each."""
-    config = make_config(options)
-    learner = make_learner(config)
-    env, networks, unroll = learner.env.unwrapped, learner.networks, config.ppo.unroll
-    state = learner.init(config.seed)
-    for _ in range(options.warm_up):
-        state, _ = learner.step(state)
-    here = config.num_envs // learner.devices
+class Parts:
+    """The parts of an iteration, each as a function without argument."""
 
-    def spread(function: Callable[..., Any], specs: Any, *arguments: Any) -> Callable[[], Any]:
-        """A function of the environments of one device, compiled for all of them, what it closes over passed along."""
-        local = jax.tree.map(
-            lambda spec, tree: jax.tree.map(
-                lambda x: jax.ShapeDtypeStruct((here, *x.shape[1:]) if spec == P(AXIS) else x.shape, x.dtype),
-                tree,
-            ),
-            tuple(specs),
-            arguments,
-            is_leaf=lambda x: isinstance(x, P),
+    def __init__(self, options: Options):
+        self.config = settings.changed(
+            settings.default_config(),
+            {
+                "env.terrain.kind": options.terrain,
+                "env.terrain.num_terrains": options.num_terrains,
+                "num_envs": options.num_envs,
+                "ppo.unroll": options.unroll,
+            },
         )
-        constants, pure = hoist(function, *local)
-        out = jax.tree.map(lambda _: P(AXIS), jax.eval_shape(function, *local))
-        run = jax.jit(
-            jax.shard_map(pure, mesh=learner.mesh, in_specs=(P(), *specs), out_specs=out, check_vma=False)
-        )
+        settings.validate(self.config)
+        self.learner = make_learner(self.config)
+        self.env: envs.QuadrupedEnv = self.learner.env.unwrapped
+        self.state = self.learner.init(self.config.seed)
+        for _ in range(options.warm_up):
+            self.state, _ = self.learner.step(self.state)
+
+    def all(self) -> dict[str, Callable[[], Any]]:
+        """By name."""
+        unroll = self.config.ppo.unroll
+        steps = timing.env_steps(self.learner, unroll)
+        return {
+            "iteration": lambda: self.learner.step(self.state),
+            "environment": lambda: steps(self.state.env_state),
+            "physics": self.physics(unroll),
+            "contact look-ups": self.repeated(self.contacts, unroll * self.env.substeps),
+            "height look-ups": self.repeated(self.heights, unroll * HEIGHT_LOOK_UPS),
+            "policy": self.policy(unroll),
+            "update": self.update(),
+        }
+
+    def repeated(self, step: Callable[[envs.Episode], envs.Episode], times: int) -> Callable[[], Any]:
+        """So many steps of every environment's episode, with what `step` closes over passed along."""
+        learner, episodes = self.learner, self.state.env_state.pipeline_state
+        here = self.config.num_envs // learner.devices
+
+        def run(episodes: envs.Episode) -> envs.Episode:
+            return jax.lax.scan(lambda e, _: (jax.vmap(step)(e), None), episodes, length=times)[0]
+
+        local = jax.tree.map(lambda x: jax.ShapeDtypeStruct((here, *x.shape[1:]), x.dtype), episodes)
+        constants, pure = hoist(run, local)
         constants = jax.device_put(constants, jax.sharding.NamedSharding(learner.mesh, P()))
-        return lambda: run(constants, *arguments)
+        compiled = self.jit(pure, (P(), P(AXIS)), P(AXIS))
+        return lambda: compiled(constants, episodes)
 
-    def repeated(step: Callable[[Any], Any], times: int = unroll) -> Callable[[Any], Any]:
-        return lambda carried: jax.lax.scan(lambda c, _: (step(c), None), carried, length=times)[0]
+    def jit(self, function: Callable[..., Any], in_specs: Any, out_specs: Any) -> Callable[..., Any]:
+        """A function of one device's share, compiled for all of them."""
+        shard = functools.partial(jax.shard_map, mesh=self.learner.mesh, check_vma=False)
+        return jax.jit(shard(function, in_specs=in_specs, out_specs=out_specs))
 
-    episodes, obs = state.env_state.pipeline_state, state.env_state.obs
-    desired = jnp.asarray(env.core.standing_target)
+    def physics(self, steps: int) -> Callable[[], Any]:
+        """Control steps on a plane."""
+        desired = jnp.asarray(self.env.core.standing_target)
+        with mock.patch.object(terrains, "contact", flat_contact):  # while it is traced
+            return self.repeated(lambda e: self.env._simulate(e, desired), steps)
 
-    def physics(episode):
-        return jax.vmap(lambda e: env._simulate(e, desired))(episode)
+    def contacts(self, e: envs.Episode) -> envs.Episode:
+        """One look-up of the surfaces near four feet."""
+        feet = jnp.asarray(self.env.core.base_foot)[:, :2]
+        centres = e.qpos[:3] + jnp.concatenate([feet, -e.qpos[2] * jnp.ones((4, 1))], axis=1)
+        found = terrains.contact(self.env.bank, e.terrain, centres, e.floor, self.config.env.num_planes)
+        return e.replace(qpos=e.qpos + NOTHING * sum(jnp.sum(x) for x in found))
 
-    def contacts(episode):
-        def one(e):
-            centres = e.qpos[:3] + jnp.concatenate(
-                [jnp.asarray(env.core.base_foot)[:, :2], -e.qpos[2] * jnp.ones((4, 1))], 1
-            )
-            found = terrains.contact(env.bank, e.terrain, centres, e.floor, config.env.num_planes)
-            # Moves on by nothing, which the compiler can't know.
-            return e.replace(qpos=e.qpos + 1e-12 * sum(jnp.sum(x) for x in found))
+    def heights(self, e: envs.Episode) -> envs.Episode:
+        """One look-up of 100 heights."""
+        core = self.env.core
+        seen = self.env._heights(e, core.sample_points(core.feet(exact_sensors(e))))
+        return e.replace(qpos=e.qpos + NOTHING * jnp.sum(seen))
 
-        return jax.vmap(one)(episode)
+    def policy(self, steps: int) -> Callable[[], Any]:
+        """The policy's steps, with sampling."""
+        networks, s = self.learner.networks, self.state
+        distribution = networks.parametric_action_distribution
 
-    def heights(episode):
-        def one(e):
-            seen = env._heights(e, env.core.sample_points(env.core.feet(_exact(e))))
-            return e.replace(qpos=e.qpos + 1e-12 * jnp.sum(seen))
+        def run(obs: dict[str, jax.Array], params: Any, normaliser: Any) -> dict[str, jax.Array]:
+            def step(obs: dict[str, jax.Array], key: jax.Array) -> tuple[dict[str, jax.Array], None]:
+                parameters = networks.policy_network.apply(normaliser, params, obs)
+                done = distribution.postprocess(distribution.sample_no_postprocessing(parameters, key))
+                state = obs["state"] + NOTHING * jnp.sum(done["action"])
+                return obs | {"carry": done["carry"], "state": state}, None
 
-        return jax.vmap(one)(episode)
+            return jax.lax.scan(step, obs, jax.random.split(jax.random.PRNGKey(0), steps))[0]
 
-    def env_step(env_state):
-        action = {"action": jnp.zeros((here, env.action_size)), "carry": env_state.obs["carry"]}
-        return learner.env.step(env_state, action)
+        compiled = self.jit(run, (P(AXIS), P(), P()), P(AXIS))
+        return lambda: compiled(s.env_state.obs, s.params.policy, s.normaliser)
 
-    def policy(obs, params, normaliser):
-        def step(obs, key):
-            raw = networks.parametric_action_distribution.sample_no_postprocessing(
-                networks.policy_network.apply(normaliser, params, obs), key
-            )
-            done = networks.parametric_action_distribution.postprocess(raw)
-            return obs | {
-                "carry": done["carry"],
-                "state": obs["state"] + 1e-12 * jnp.sum(done["action"]),
-            }, None
-
-        return jax.lax.scan(step, obs, jax.random.split(jax.random.PRNGKey(0), unroll))[0]
-
-    shard = functools.partial(jax.shard_map, mesh=learner.mesh, check_vma=False)
-    roll = shard(
-        learner._rollout, in_specs=(P(), learner.specs, P()), out_specs=(P(AXIS), P(None, AXIS), P())
-    )
-    env_state, rollout, _ = jax.jit(roll)(learner._step_constants, state, state.key)
-    carry, last = obs["carry"], env_state.obs["privileged_state"]
-    update = jax.jit(
-        shard(
-            learner._update,
-            in_specs=(learner.specs, P(AXIS), P(None, AXIS), P(AXIS), P()),
-            out_specs=P(),
-        )
-    )
-
-    with mock.patch.object(terrains, "contact", flat_contact):
-        on_a_plane = spread(repeated(physics), [P(AXIS)], episodes)
-        jax.block_until_ready(on_a_plane())  # traced while the patch holds
-    return {
-        "iteration": lambda: learner.step(state),
-        "environment": spread(repeated(env_step), [P(AXIS)], state.env_state),
-        "physics": on_a_plane,
-        "contact look-ups": spread(repeated(contacts, unroll * env.substeps), [P(AXIS)], episodes),
-        "height look-ups": spread(repeated(heights, unroll * HEIGHT_LOOK_UPS), [P(AXIS)], episodes),
-        "policy": spread(policy, [P(AXIS), P(), P()], obs, state.params.policy, state.normaliser),
-        "update": lambda: update(state, carry, rollout, last, state.key),
-    }
-
-
-HEIGHT_LOOK_UPS = 3
-"""Look-ups of 100 heights in a step: for the reward, for the policy (drifted) and for the critic (exact)."""
-
-
-def _exact(episode: Any) -> Any:
-    from envs.env import exact_sensors
-
-    return exact_sensors(episode)
+    def update(self) -> Callable[[], Any]:
+        """The gradient steps on a rollout."""
+        learner, s = self.learner, self.state
+        over_time = P(None, AXIS)
+        roll = self.jit(learner._rollout, (P(), learner.specs, P()), (P(AXIS), over_time, P()))
+        env_state, rollout, _ = roll(learner._step_constants, s, s.key)
+        compiled = self.jit(learner._update, (learner.specs, P(AXIS), over_time, P(AXIS), P()), P())
+        carry, last = s.env_state.obs["carry"], env_state.obs["privileged_state"]
+        return lambda: compiled(s, carry, rollout, last, s.key)
 
 
 def measure(options: Options) -> dict[str, Any]:
     """Median seconds of each part, its share of the iteration, and steps per second."""
-    functions = parts(options)
-    times: dict[str, list[float]] = {name: [] for name in functions}
-    for name, function in functions.items():
-        began = time.perf_counter()
-        jax.block_until_ready(function())
-        print(f"{name}: compiled in {time.perf_counter() - began:.0f} s", file=sys.stderr, flush=True)
-    for _ in range(options.rounds):
-        for name, function in functions.items():
-            began = time.perf_counter()
-            jax.block_until_ready(function())
-            times[name].append(time.perf_counter() - began)
-    seconds = {name: statistics.median(values) for name, values in times.items()}
+    seconds = timing.medians(Parts(options).all(), options.rounds)
     known = ("physics", "contact look-ups", "height look-ups")
     seconds["rest of the environment"] = seconds["environment"] - sum(seconds[k] for k in known)
     steps = options.num_envs * options.unroll
@@ -203,26 +172,16 @@ def measure(options: Options) -> dict[str, Any]:
         "training_vs_env": seconds["environment"] / seconds["iteration"],
         "share_of_iteration": {k: v / seconds["iteration"] for k, v in seconds.items()},
         "seconds": seconds,
-        "settings": dataclasses.asdict(options),
-        "machine": {
-            "devices": len(jax.devices()),
-            "kind": jax.devices()[0].device_kind,
-            "cores": os.cpu_count(),
-        },
     }
 
 
 def main(arguments: Sequence[str]) -> None:
     """Prints the shares, and writes the JSON."""
     options = cli.parse(Options, arguments, __doc__ or "")
+    cli.check_folders(options, "json")
     settings.use_cache(settings.TrainConfig().cache)
-    result = measure(options)
-    text = json.dumps(result, indent=1)
-    print(text)
-    if options.json:
-        with open(options.json, "w") as file:
-            file.write(text + "\n")
+    timing.put_out(measure(options), dataclasses.asdict(options), options.json)
 
 
 if __name__ == "__main__":
-    cli.run(main)
+    cli.run(main, sys.argv[1:])

@@ -16,9 +16,6 @@ Everything is measured in one process, the sides of a comparison in turn, median
 """
 
 import dataclasses
-import json
-import os
-import statistics
 import subprocess
 import sys
 import tempfile
@@ -27,9 +24,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from tlq.cores import use_all_cores
+from tlq import cores
 
-use_all_cores()  # before JAX starts
+cores.use_all_cores()  # before JAX starts
 
 import jax  # noqa: E402
 import jax.numpy as jnp  # noqa: E402
@@ -39,9 +36,11 @@ import numpy as np  # noqa: E402
 
 import envs  # noqa: E402
 import terrains  # noqa: E402
+from benchmarks import timing  # noqa: E402
 from envs.robot import robot_spec  # noqa: E402
 from tlq import cli  # noqa: E402
 from tlq import config as settings  # noqa: E402
+from tlq.ppo import NORMALISED  # noqa: E402
 from tlq.training import make_learner  # noqa: E402
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -66,17 +65,15 @@ class Environments:
     """Environments in training, without the policy: a function that makes some steps."""
 
     def __init__(self, kind: str, num_envs: int, num_terrains: int):
-        config = settings.default_config()
-        for key, value in {
-            "env.terrain.kind": kind,
-            "env.terrain.num_terrains": num_terrains,
-            "num_envs": num_envs,
-        }.items():
-            config = settings.replace(config, key, value)
-        self.config, self.learner = config, make_learner(config)
+        self.config = settings.changed(
+            settings.default_config(),
+            {"env.terrain.kind": kind, "env.terrain.num_terrains": num_terrains, "num_envs": num_envs},
+        )
+        settings.validate(self.config)
+        self.learner = make_learner(self.config)
         self.state = self.learner.init(0)
         self.bank: terrains.Bank = self.learner.env.unwrapped.bank
-        self._run = self.learner.jit_steps(STEPS)
+        self._run = timing.env_steps(self.learner, STEPS)
 
     def run(self) -> None:
         """STEPS steps of every environment, which go on from the last ones."""
@@ -89,25 +86,29 @@ class Environments:
         return self.config.num_envs * STEPS
 
     def sizes(self) -> dict[str, float]:
-        """Bytes of an environment's state and of a terrain."""
-        state = sum(x.nbytes for x in jax.tree.leaves(self.state.env_state))
+        """Bytes of an environment's state, of its part of a rollout, of a terrain; number of parameters."""
+        learner = self.learner
+        here = jax.eval_shape(lambda: self.state.env_state.obs)
+        row = sum(here[k].size for k in (*NORMALISED, "is_first")) / self.config.num_envs
+        row += (
+            3 * learner.env.action_size + 4
+        )  # action, distribution; log-probability, reward, done, truncation
         return {
-            "bytes_per_env": state / self.config.num_envs,
+            "bytes_per_env": _bytes(self.state.env_state) / self.config.num_envs,
+            "rollout_bytes_per_env": 4 * row * self.config.ppo.unroll,
             "bytes_per_terrain": self.bank.nbytes / self.bank.num_terrains,
+            "parameters": sum(x.size for x in jax.tree.leaves(self.state.params)),
         }
+
+
+def _bytes(tree: Any) -> int:
+    return sum(x.nbytes for x in jax.tree.leaves(tree))
 
 
 def rates(sides: dict[str, tuple[Callable[[], None], int]], rounds: int) -> dict[str, float]:
     """Median steps per second of functions and their steps, measured in turn."""
-    times: dict[str, list[float]] = {name: [] for name in sides}
-    for function, _ in sides.values():
-        function()  # compiles
-    for _ in range(rounds):
-        for name, (function, _) in sides.items():
-            began = time.perf_counter()
-            function()
-            times[name].append(time.perf_counter() - began)
-    return {name: steps / statistics.median(times[name]) for name, (_, steps) in sides.items()}
+    seconds = timing.medians({name: function for name, (function, _) in sides.items()}, rounds)
+    return {name: steps / seconds[name] for name, (_, steps) in sides.items()}
 
 
 class MujocoC:
@@ -118,9 +119,7 @@ class MujocoC:
         self.substeps = round(config.control_dt / config.physics_dt)
         heights = np.asarray(terrains.make_bank(terrain.kind, 1, terrain.seed, ["paper"], terrain).heights[0])
         self.model = self._model(config, heights.astype(float).T * 1e-3)
-        self.threads = (
-            len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-        )
+        self.threads = cores.count()
         self.data = [mujoco.MjData(self.model) for _ in range(self.threads)]
         desired, start = recorded(config)
         control = np.repeat(desired, self.substeps, axis=1)
@@ -212,7 +211,7 @@ def playground(options: Options, rate: float) -> float | str:
         env = registry.load(name, config_overrides={"impl": "jax"})
         state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), options.num_envs))
     except Exception as error:  # its meshes are fetched from the network
-        return f"skipped: {' '.join(str(error).split())[:200]}"
+        return f"skipped: {cli.one_line(error)[:200]}"
     action = jnp.zeros((options.num_envs, env.action_size))
     run = jax.jit(
         lambda s: jax.lax.scan(lambda s, _: (jax.vmap(env.step)(s, action), None), s, length=STEPS)[0]
@@ -259,21 +258,14 @@ def start(options: Options) -> dict[str, float]:
 def main(arguments: Sequence[str]) -> None:
     """Prints the JSON."""
     options = cli.parse(Options, arguments, __doc__ or "")
+    cli.check_folders(options, "json")
     settings.use_cache(settings.TrainConfig().cache)
     result = compare(options)
     if options.scaling:
         result |= scaling(options)
     if options.start:
         result |= start(options)
-    devices = jax.devices()
-    result |= {
-        "settings": dataclasses.asdict(options),
-        "machine": {"devices": len(devices), "kind": devices[0].device_kind, "cores": os.cpu_count()},
-    }
-    text = json.dumps(result, indent=1)
-    print(text)
-    if options.json:
-        Path(options.json).write_text(text + "\n")
+    timing.put_out(result, dataclasses.asdict(options), options.json)
 
 
 if __name__ == "__main__":

@@ -45,7 +45,7 @@ class QuadrupedEnv(Env):
         self._model = mjx.put_model(self.mj_model)
         self._data = mjx.make_data(self._model)
         self._planes = physics.plane_ids(self.mj_model, config.num_planes)
-        self._rings = np.array([radius for count, radius in tg.samples.RINGS for _ in range(count)])
+        self._near = tg.samples.within(config.rewards.terrain_ring)
 
     # -- Brax's interface
 
@@ -112,18 +112,7 @@ class QuadrupedEnv(Env):
         """A new episode on a level () int32 of the ladder."""
         c = self.config
         keys = iter(jax.random.split(key, 11))
-        lower = jax.random.randint(next(keys), (), 0, jnp.maximum(level, 1))
-        visited = jnp.where(jax.random.uniform(next(keys)) < c.curriculum.revisit, lower, level)
-        # Instance k has difficulty k % levels.
-        rows = max(self.bank.num_terrains // self.levels, 1)
-        row, key_practice = jax.random.randint(next(keys), (), 0, rows), next(keys)
-        practised = jax.random.randint(key_practice, (), 0, self.levels)
-        place = lambda level: (row * self.levels + level) % self.bank.num_terrains  # noqa: E731
-        practice = jax.random.uniform(jax.random.fold_in(key_practice, 0)) < c.curriculum.practice
-        practice &= c.curriculum.enabled & (self.bank.floor[place(practised)] < -0.1)
-        counts = (visited == level) & ~practice
-        level = jnp.where(practice, practised, visited)
-        terrain = place(level)
+        level, terrain, practice = self._draw_terrain([next(keys) for _ in range(5)], level)
         xy = jax.random.uniform(next(keys), (2,), minval=-1.0, maxval=1.0) * c.spawn_offset
         yaw, angle = jax.random.uniform(next(keys), (2,), minval=-1.0, maxval=1.0) * jnp.array(
             [c.spawn_yaw, jnp.pi]
@@ -148,7 +137,6 @@ class QuadrupedEnv(Env):
             controller=self.core.initial_state(phase),
             terrain=terrain,
             level=level,
-            counts=counts,
             practice=practice,
             floor=jnp.maximum(self.bank.floor[terrain], -depth),
             command=command,
@@ -160,6 +148,25 @@ class QuadrupedEnv(Env):
             randomised=self._randomise(next(keys)),
             key=next(keys),
         )
+
+    def _draw_terrain(
+        self, keys: list[jax.Array], level: jax.Array
+    ) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """Level, instance in the bank and whether footholds are practised, from the level of the ladder; each ()."""
+        c = self.config.curriculum
+        lower = jax.random.randint(keys[0], (), 0, jnp.maximum(level, 1))
+        level = jnp.where(jax.random.uniform(keys[1]) < c.revisit, lower, level)
+        practised = jax.random.randint(keys[2], (), 0, self.levels)
+        row = jax.random.randint(keys[3], (), 0, max(self.bank.num_terrains // self.levels, 1))
+
+        def place(level: jax.Array) -> jax.Array:
+            # Instance k has difficulty k % levels.
+            return (row * self.levels + level) % self.bank.num_terrains
+
+        pit = self.bank.floor[place(practised)] < -self.config.rewards.gap_threshold
+        practice = c.enabled & pit & (jax.random.uniform(keys[4]) < c.practice)
+        level = jnp.where(practice, practised, level)
+        return level, place(level), practice
 
     def advance(self, state: State, action: jax.Array) -> State:
         """`step` without the observation."""
@@ -217,7 +224,7 @@ class QuadrupedEnv(Env):
             return level
         reachable = min(self.config.rewards.speed_low * self.config.episode_time, GOAL)
         walked = jnp.sum(jnp.square(episode.command)) > 0.5
-        counts = walked & episode.counts
+        counts = walked & ~episode.practice & (episode.level == level)  # not what was revisited
         up = counts & ~fell & (episode.progress > c.up * reachable)
         down = counts & (episode.progress < c.down * reachable)
         return jnp.clip(level + up.astype(jnp.int32) - down.astype(jnp.int32), 0, self.levels - 1)
@@ -283,7 +290,10 @@ class QuadrupedEnv(Env):
         # How much of each circle round a foot is a gap: what the foot is about to earn, put plainly.
         low = jnp.max(true, axis=1, keepdims=True) - true > self.config.rewards.gap_threshold
         gaps = jnp.stack(
-            [*(jnp.mean(low[:, r], axis=1) for r in _circles()), self._aim(episode, true + episode.qpos[2])],
+            [
+                *(jnp.mean(low[:, r], axis=1) for r in tg.samples.circles()),
+                self._aim(episode, true + episode.qpos[2]),
+            ],
             axis=1,
         )
         rest = jnp.concatenate(
@@ -399,31 +409,21 @@ class QuadrupedEnv(Env):
         self, before: Episode, after: Episode, below: jax.Array, around: jax.Array
     ) -> dict[str, jax.Array]:
         c = self.config.rewards
-        velocity, command = after.qvel[:2], after.command
-        walking = jnp.sum(jnp.square(command)) > 0.5
-        phases = tg.path.leg_phases(after.controller.phase)
-        swing = (phases > 0) & walking
-        near = self._rings <= c.terrain_ring + 1e-6
-        rise = jnp.maximum(jnp.max(around, axis=1) - after.lift_off, 0.0)
-        along = rewards.along(velocity @ command, c.speed_low, c.speed_high, literal=c.literal)
-        return {
-            "along": jnp.where(walking, along, rewards.standing(velocity, c.speed_low)),
-            "across": rewards.across(velocity, command),
-            "smooth": rewards.smooth(after.controller.desired, before.controller.desired),
-            "energy": rewards.energy(after.torque, after.qvel[6:], literal=c.literal),
-            "terrain": jnp.mean(
-                rewards.terrain(
-                    ~swing, below[:, near], jnp.min(below, axis=1), c.gap_threshold, graded=c.terrain_graded
-                )
-            ),
-            "aim": jnp.mean(self._aim(after, around)),
-            "height": jnp.mean(
-                jnp.where(swing, rewards.height(after.controller.lift, rise, c.lift_threshold), 0.0)
-            ),
-            "yaw": -jnp.square(after.qvel[5]),
-            "heading": jnp.cos(tg.frames.yaw(after.qpos[3:7]) - after.heading) - 1.0,
-            "tilt": -0.1 * jnp.sum(jnp.square(after.qvel[3:5])),
-        }
+        step = rewards.Step(
+            velocity=after.qvel[:2],
+            angular_velocity=after.qvel[3:6],
+            command=after.command,
+            desired=after.controller.desired,
+            previous=before.controller.desired,
+            energy=rewards.energy(after.torque, after.qvel[6:], literal=c.literal),
+            swing=tg.path.leg_phases(after.controller.phase) > 0,
+            near=below[:, self._near],
+            highest=jnp.min(below, axis=1),
+            lift=after.controller.lift,
+            rise=jnp.maximum(jnp.max(around, axis=1) - after.lift_off, 0.0),
+            drift=tg.frames.yaw(after.qpos[3:7]) - after.heading,
+        )
+        return rewards.step_terms(c, step) | {"aim": jnp.mean(self._aim(after, around))}
 
     def landing_points(self, episode: Episode) -> jax.Array:
         """Where the feet (L, 2) m in swing will come down, from the trunk's centre, heading frame.
@@ -450,8 +450,7 @@ class QuadrupedEnv(Env):
           episode: what is judged.
           around: (L, P) m, terrain heights round the feet, world.
         """
-        near = self._rings <= self.config.rewards.terrain_ring + 1e-6
-        offsets = jnp.asarray(tg.samples.ring_offsets(), jnp.float32)[np.flatnonzero(near)]
+        offsets = jnp.asarray(tg.samples.ring_offsets()[self._near], jnp.float32)
         there = self._heights(episode, self.landing_points(episode)[:, None] + offsets) + episode.qpos[2]
         highest = jnp.maximum(jnp.max(around, axis=1), jnp.max(there, axis=1))
         swing = tg.path.leg_phases(episode.controller.phase) > 0
@@ -486,12 +485,6 @@ class QuadrupedEnv(Env):
 
     def _share(self, level: jax.Array) -> jax.Array:
         return level / max(self.levels - 1, 1)
-
-
-def _circles() -> list[slice]:
-    """The points of each circle among a foot's P."""
-    ends = np.cumsum([0, *(count for count, _ in tg.samples.RINGS)])
-    return [slice(a, b) for a, b in zip(ends[:-1], ends[1:], strict=True)]
 
 
 def exact_sensors(episode: Episode) -> tg.Sensors:

@@ -80,7 +80,7 @@ def substep(
     feet: np.ndarray,
     contact: Contact,
     qfrc: jax.Array,
-    iterations: int = 2,
+    iterations: int,
 ) -> mjx.Data:
     """Advances the physics by one timestep.
 

@@ -40,8 +40,6 @@ class Episode(flax.struct.PyTreeNode):
     """() int32, instance in the bank."""
     level: jax.Array
     """() int32, level of the ladder that this episode is on."""
-    counts: jax.Array
-    """() bool, whether the episode counts for the ladder: not if it revisits an easier level or practises footholds."""
     practice: jax.Array
     """() bool, whether footholds are practised above shallow pits."""
     floor: jax.Array

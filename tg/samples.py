@@ -10,8 +10,17 @@ RINGS = ((1, 0.0), (6, 0.03), (8, 0.06), (10, 0.10))
 
 COUNT = sum(count for count, _ in RINGS)
 """P = 25."""
-RING_OF_POINT = tuple(ring for ring, (count, _) in enumerate(RINGS) for _ in range(count))
-"""Index into `RINGS` of each of the P = 25 points."""
+
+
+def within(radius: float) -> slice:
+    """The points on circles up to a radius (m): the first ones, as the circles grow."""
+    return slice(0, sum(count for count, ring in RINGS if ring <= radius + 1e-6))
+
+
+def circles() -> list[slice]:
+    """The points of each circle."""
+    ends = [sum(count for count, _ in RINGS[:i]) for i in range(len(RINGS) + 1)]
+    return [slice(a, b) for a, b in zip(ends[:-1], ends[1:], strict=True)]
 
 
 def ring_offsets() -> list[tuple[float, float]]:

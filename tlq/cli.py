@@ -109,6 +109,20 @@ def find_policy(name: str) -> Path:
     )
 
 
+def check_folders(options: Any, *names: str) -> None:
+    """Raises UsageError where the folder of a file that is to be written isn't there."""
+    for name in names:
+        value = getattr(options, name)
+        folder = Path(value).absolute().parent
+        if value and not folder.is_dir():
+            raise UsageError(f"{name}={value}: there is no folder {folder}")
+
+
+def one_line(error: BaseException) -> str:
+    """What an error says, without line breaks."""
+    return " ".join(str(error).split())
+
+
 def run(main: Callable[[Sequence[str]], None], arguments: Sequence[str] | None = None) -> None:
     """Calls `main` with the command line; an error of the user's is one line and exit code 2."""
     try:
@@ -122,7 +136,7 @@ def run(main: Callable[[Sequence[str]], None], arguments: Sequence[str] | None =
 
 def fail(error: Exception, *, at_once: bool = False) -> NoReturn:
     """One line and exit code 2; at_once: without waiting for threads that may still want to write to a full disk."""
-    print(f"error: {' '.join(str(error).split())}", file=sys.stderr, flush=True)
+    print(f"error: {one_line(error)}", file=sys.stderr, flush=True)
     if at_once:
         sys.stdout.flush()
         os._exit(2)

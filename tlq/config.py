@@ -8,16 +8,16 @@ import os
 import time
 import types
 import typing
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from envs.config import METHODS
 from tlq.cli import UsageError, unknown
 from tlq.files import whole
 from tlq.networks import NetworkConfig
 from tlq.ppo import PPOConfig
 
-METHODS = ("ours", "fixed_height", "blind")
 _WIDTH = (1, 4096)
 LIMITS: dict[str, tuple[float, float]] = {
     "num_envs": (1, 1 << 22),
@@ -121,10 +121,14 @@ def make(
     }
     if num_terrains is not None:
         values["terrain.num_terrains"] = num_terrains
-    config = envs.EnvConfig()
+    return envs.make(changed(envs.EnvConfig(), values))
+
+
+def changed(config: Any, values: Mapping[str, Any]) -> Any:
+    """Copy of a nested dataclass with the fields at dotted keys set."""
     for key, value in values.items():
         config = replace(config, key, value)
-    return envs.make(config)
+    return config
 
 
 def replace(config: Any, key: str, value: Any) -> Any:

@@ -3,13 +3,18 @@
 import os
 
 
+def count() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 def use_all_cores() -> None:
     """Shows JAX the CPU as several devices, a power of two, over which training splits its environments.
 
     XLA runs a step of the physics, hundreds of small operations, mostly on one thread: on two cores, two devices train
     about 1.3 times as fast as one. Settings made by the user are left alone; GPUs are not concerned.
     """
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    cores = count()
     devices = 1 << (min(cores, 16).bit_length() - 1)
     flags = os.environ.get("XLA_FLAGS", "")
     if "xla_force_host_platform_device_count" not in flags:

@@ -22,7 +22,7 @@ import numpy as np
 import envs
 import terrains
 from tlq import judge
-from tlq.cli import find_policy, option, parse, run
+from tlq.cli import check_folders, find_policy, option, parse, run
 from tlq.config import build
 from tlq.files import whole
 from tlq.runtime import Controller, load_policy
@@ -78,9 +78,7 @@ def _check(options: Options) -> None:
         raise ValueError(f"seed={options.seed} must be 0 or more")
     if not 0 < options.timestep <= 0.02:
         raise ValueError(f"timestep={options.timestep} must be in (0, 0.02]")
-    folder = Path(options.json).absolute().parent
-    if options.json and not folder.is_dir():
-        raise ValueError(f"json={options.json}: there is no folder {folder}")
+    check_folders(options, "json")
 
 
 # -- engines ---------------------------------------------------------------------------------------------------------

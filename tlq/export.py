@@ -70,7 +70,7 @@ def write(
         raise ValueError(
             f"the normaliser is for {kept[_MEAN].size} observed values, the environment shows {size}"
         )
-    if "leg_action" in {name.removeprefix(_PARAMS).partition(".")[0] for name in kept}:
+    if f"{_PARAMS}leg_action.kernel" in kept:
         kept["leg_sign"] = LEG_SIGN
     nodes = policy_graph(config.policy, kept, heights=100 if config.env.method != "blind" else 0)
     Graph(nodes, kept)

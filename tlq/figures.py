@@ -9,13 +9,12 @@ name of a policy that comes with tlq; those left empty aren't drawn.
 
 import dataclasses
 import json
-import math
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+import envs
 import terrains
 import tg
 from tlq import cli, judge
@@ -29,7 +28,6 @@ RISES = (0.03, 0.075, 0.12)
 """Stairs of the paper's figure (m)."""
 COURSES = ((0.085, 0.17, 0.255), (0.068, 0.204, 0.136))
 """Gaps of its two courses (m), in the order in which they are met."""
-METHODS = ("ours", "fixed_height", "blind")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -92,7 +90,7 @@ def walk(policy: str, terrain: terrains.Terrain, distance: float = judge.GOAL) -
 
 def chosen(options: Options) -> dict[str, str]:
     """Policies by method, those that were given."""
-    return {m: getattr(options, m) for m in METHODS if getattr(options, m)}
+    return {m: getattr(options, m) for m in envs.METHODS if getattr(options, m)}
 
 
 # -- stairs ----------------------------------------------------------------------------------------------------------
@@ -192,13 +190,10 @@ def amplitude(trace: Trace, start: float, end: float) -> float | None:
 def main(arguments: Sequence[str]) -> None:
     """The command line."""
     options = cli.parse(Options, arguments, __doc__ or "")
-    for name in ("picture", "json"):
-        folder = Path(getattr(options, name)).absolute().parent
-        if getattr(options, name) and not folder.is_dir():
-            raise ValueError(f"{name}={getattr(options, name)}: there is no folder {folder}")
+    cli.check_folders(options, "picture", "json")
     if not chosen(options):
-        raise ValueError(f"no policy is given; set one of {', '.join(METHODS)}")
-    if not math.isfinite(options.seed) or options.seed < 0:
+        raise ValueError(f"no policy is given; set one of {', '.join(envs.METHODS)}")
+    if options.seed < 0:
         raise ValueError(f"seed={options.seed} must be 0 or more")
     import matplotlib
 

@@ -4,15 +4,11 @@ World frame, SI units. Letters: L = 4 legs (LF, RF, LR, RR), P = 25 sample point
 """
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 import rewards
 import tg
 from tlq.simulation import Simulation
-
-_RINGS = np.array([radius for count, radius in tg.samples.RINGS for _ in range(count)])
-"""Distances (P,) of the sample points from their foot (m)."""
 
 
 def sample_points(sim: Simulation) -> np.ndarray:
@@ -79,50 +75,29 @@ class RewardMeter:
         """
         state, moment = sim.controller.state, sim.moment()
         self._lift_off = np.where(moment.phases > 0, self._lift_off, moment.ground[:, 0])
-        measured = {
-            "velocity": sim.data.qvel[:3],
-            "turning": sim.data.qvel[3:6],
-            "command": command,
-            "desired": state.desired,
-            "previous": self._desired,
-            "power": work / sim.controller.control_dt,
-            "phases": moment.phases,
-            "lift": state.lift,
-            "rise": np.maximum(moment.ground.max(axis=1) - self._lift_off, 0.0),
-            "below": moment.feet[:, None] - moment.ground,
-            "drift": sim.yaw - self._heading,
-        }
+        config = sim.config.rewards
+        below = moment.feet[:, None] - moment.ground
+        step = rewards.Step(
+            velocity=sim.data.qvel[:2],
+            angular_velocity=sim.data.qvel[3:6],
+            command=command,
+            desired=state.desired,
+            previous=self._desired,
+            energy=-work / sim.controller.control_dt,
+            swing=moment.phases > 0,
+            near=below[:, tg.samples.within(config.terrain_ring)],
+            highest=below.min(axis=1),
+            lift=state.lift,
+            rise=np.maximum(moment.ground.max(axis=1) - self._lift_off, 0.0),
+            drift=sim.yaw - self._heading,
+        )
         self._desired = state.desired
-        return {
-            name: float(value)
-            for name, value in jax.device_get(_compiled(sim.config.rewards, measured)).items()
-        }
+        return {name: float(value) for name, value in jax.device_get(_compiled(config, step)).items()}
 
 
-def weighted_terms(config: rewards.RewardConfig, measured: dict[str, jax.Array]) -> dict[str, jax.Array]:
-    """Each term () as it enters the reward, and their `total`; `measured` as in `RewardMeter`."""
-    m, c = measured, config
-    velocity, command = m["velocity"][:2], m["command"]
-    walking = jnp.sum(jnp.square(command)) > 0.5
-    swing = (m["phases"] > 0) & walking
-    near = np.flatnonzero(_RINGS <= c.terrain_ring + 1e-6)
-    along = rewards.along(velocity @ command, c.speed_low, c.speed_high, literal=c.literal)
-    gaps = rewards.terrain(
-        ~swing, m["below"][:, near], jnp.min(m["below"], axis=1), c.gap_threshold, graded=c.terrain_graded
-    )
-    lifted = rewards.height(m["lift"], m["rise"], c.lift_threshold)
-    terms = {
-        "along": jnp.where(walking, along, rewards.standing(velocity, c.speed_low)),
-        "across": rewards.across(velocity, command),
-        "smooth": rewards.smooth(m["desired"], m["previous"]),
-        "energy": -m["power"],
-        "terrain": jnp.mean(gaps),
-        "height": jnp.mean(jnp.where(swing, lifted, 0.0)),
-        "yaw": -jnp.square(m["turning"][2]),
-        "heading": jnp.cos(m["drift"]) - 1.0,
-        "tilt": -0.1 * jnp.sum(jnp.square(m["turning"][:2])),
-    }
-    total, weighted = rewards.total(c, terms)
+def weighted_terms(config: rewards.RewardConfig, step: rewards.Step) -> dict[str, jax.Array]:
+    """Each term () as it enters the reward, and their `total`."""
+    total, weighted = rewards.total(config, rewards.step_terms(config, step))
     return weighted | {"total": total}
 
 

@@ -23,7 +23,7 @@ RUNNING, REACHED, FELL, STUCK = range(4)
 ENDS = ("running", "reached", "fell", "stuck")
 """Names of what `Tally.ended` says."""
 
-_NEAR = slice(0, sum(count for count, radius in tg.samples.RINGS if radius <= 0.03))
+_NEAR = tg.samples.within(0.03)
 
 
 class Moment(NamedTuple):

@@ -4,37 +4,29 @@ It is Brax's `compute_ppo_loss`, but that advantages are normalised over the bat
 noise belongs to the environment: an update doesn't depend on how many devices share it, within rounding.
 """
 
-import dataclasses
-from typing import Any
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 from brax.training.agents.ppo.losses import PPONetworkParams, compute_gae
 from brax.training.agents.ppo.networks import PPONetworks
 
-
-@dataclasses.dataclass(frozen=True)
-class LossConfig:
-    """Weights of the loss; see `tlq.ppo.PPOConfig`."""
-
-    discount: float
-    gae_lambda: float
-    clip: float
-    entropy: float
-    value_loss: float
-    reward_scaling: float
+if TYPE_CHECKING:
+    from tlq.ppo import PPOConfig, Rollout
 
 
 def ppo_loss(
     params: PPONetworkParams,
     normaliser: Any,
-    rollout: Any,
+    rollout: Rollout,
     carry: jax.Array,
     last: jax.Array,
     keys: jax.Array,
     *,
     networks: PPONetworks,
-    config: LossConfig,
+    config: PPOConfig,
     axis: str,
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
     """Loss of B environments over T steps, on one device of the mesh axis `axis`; its mean over the axis is the loss.
@@ -42,7 +34,7 @@ def ppo_loss(
     Args:
       params: of policy and critic.
       normaliser: of the observation.
-      rollout: `tlq.ppo.Rollout`, (T, B, ...).
+      rollout: (T, B, ...).
       carry: (B, C) from before the first step.
       last: (B, V) 'privileged_state' after the last step.
       keys: (B, 2) uint32, for the entropy's noise.

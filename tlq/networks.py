@@ -128,8 +128,7 @@ class Policy(nn.Module):
         x = nn.elu(Dense(c.encoder, name="proprio")(proprio))
         foot = None
         if heights is not None:
-            if heights.shape[-1] == c.feet * tg.samples.COUNT:
-                heights = heights[..., SAME_SIDE]
+            heights = heights[..., SAME_SIDE]
             foot = heights.reshape(*heights.shape[:-1], c.feet, heights.shape[-1] // c.feet)
             for i, width in enumerate(c.foot_encoder):
                 foot = nn.elu(Dense(width, name=f"foot_{i}")(foot))
@@ -145,7 +144,7 @@ class Policy(nn.Module):
             2 * self.action_size, kernel_init=small, bias_init=_head_bias(c.initial_std), name="action"
         )
         action = out(y)
-        if foot is not None and c.leg_head and self.action_size == 2 + 3 * c.feet:
+        if foot is not None and c.leg_head:
             context = Dense(c.feet * c.leg_context, name="to_legs")(y)
             context = context.reshape(*foot.shape[:-1], c.leg_context)
             leg = nn.elu(Dense(c.leg_head, name="leg")(jnp.concatenate([foot, context], axis=-1)))

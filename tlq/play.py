@@ -12,14 +12,13 @@ import os
 import sys
 import time
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 import terrains
 from tlq import render, viewer
-from tlq.cli import find_policy, option, parse, run
+from tlq.cli import check_folders, find_policy, option, parse, run
 from tlq.evaluate import FIRST_SEED, training_env
 from tlq.judge import GOAL
 from tlq.runtime import Controller, load_policy
@@ -163,8 +162,7 @@ def check(options: Options) -> None:
         value = getattr(options, name)
         if value and not value.endswith(ending):
             raise ValueError(f"{name}={value} must end in {ending}")
-        if value and not Path(value).absolute().parent.is_dir():
-            raise ValueError(f"{name}={value}: there is no folder {Path(value).absolute().parent}")
+    check_folders(options, "video", "picture")
     find_policy(options.policy)
     if shown(options) and options.viewer == "browser":
         viewer.load_viser()

@@ -23,7 +23,7 @@ from brax.training.agents.ppo.networks import PPONetworks
 from jax.sharding import Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
 
-from tlq.loss import LossConfig, ppo_loss
+from tlq.loss import ppo_loss
 
 AXIS = "data"
 NORMALISED = ("state", "privileged_state")
@@ -142,19 +142,7 @@ class Learner:
         self._optimiser = optax.chain(
             optax.clip_by_global_norm(config.max_grad_norm), optax.scale_by_adam(eps=1e-5)
         )
-        self._loss = functools.partial(
-            ppo_loss,
-            networks=networks,
-            config=LossConfig(
-                discount=config.discount,
-                gae_lambda=config.gae_lambda,
-                clip=config.clip,
-                entropy=config.entropy,
-                value_loss=config.value_loss,
-                reward_scaling=config.reward_scaling,
-            ),
-            axis=AXIS,
-        )
+        self._loss = functools.partial(ppo_loss, networks=networks, config=config, axis=AXIS)
         specs: list[Any] = [P(), P(), P(), P(), P(AXIS), P(), P()]  # only the environments are split
         self.specs = TrainState(*specs)
         self._hoist()
@@ -179,25 +167,6 @@ class Learner:
     def step(self, state: TrainState) -> tuple[TrainState, dict[str, jax.Array]]:
         """One iteration: the next state, and the figures () of this one."""
         return self._jitted(self._step_constants, state)
-
-    def jit_steps(self, length: int) -> Callable[[State], State]:
-        """A function that makes so many steps of all environments with action 0, for benchmarks."""
-        here = self.num_envs // self.devices
-
-        def steps(constants: list[jax.Array], env_state: State) -> State:
-            zero = jnp.zeros((here, self.env.action_size))
-
-            def one(env_state: State, _: None) -> tuple[State, None]:
-                action = {"action": zero, "carry": env_state.obs["carry"]}
-                return self._env_step(constants, env_state, action), None
-
-            return jax.lax.scan(one, env_state, length=length)[0]
-
-        sharded = jax.shard_map(
-            steps, mesh=self.mesh, in_specs=(P(), P(AXIS)), out_specs=P(AXIS), check_vma=False
-        )
-        compiled = jax.jit(sharded)
-        return lambda env_state: compiled(self._step_constants, env_state)
 
     # -- state ---------------------------------------------------------------------------------------------------------
 

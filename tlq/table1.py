@@ -15,12 +15,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import envs
 from tlq import cli, evaluate
 from tlq.cli import option
 from tlq.files import whole
 
 TERRAINS = ("blocks", "stairs", "stepping_stones", "poles")
-METHODS = ("ours", "fixed_height", "blind")
 PAPER = {
     "ours": (4.983, 4.951, 4.954, 4.930),
     "fixed_height": (4.911, 4.859, 1.782, 1.924),
@@ -97,7 +97,7 @@ def table(options: Options, results: dict[str, dict[str, Any]]) -> str:
         "| method | policy | engine | " + " | ".join(t.replace("_", " ") for t in TERRAINS) + " |",
         "| --- | --- | --- |" + " --- |" * len(TERRAINS),
     ]
-    for method in METHODS:
+    for method in envs.METHODS:
         lines.append(
             f"| {method} | the paper's | PyBullet | " + " | ".join(f"{x:.3f}" for x in PAPER[method]) + " |"
         )
@@ -123,7 +123,7 @@ def draw(options: Options, results: dict[str, dict[str, Any]], path: str) -> Non
     found, engine = policies(), "mujoco" if options.engine == "both" else options.engine
     figure, axes = plt.subplots(1, len(TERRAINS), figsize=(13, 3.2), sharey=True, constrained_layout=True)
     for column, (axis, terrain) in enumerate(zip(axes, TERRAINS, strict=True)):
-        for i, method in enumerate(METHODS):
+        for i, method in enumerate(envs.METHODS):
             axis.bar(3 * i, PAPER[method][column], 0.8, fill=False)
             for j, kind in enumerate(KINDS):
                 key = f"{found.get((method, kind, terrain))}/{terrain}/{engine}/{options.episodes}/{options.seed}"
@@ -133,7 +133,7 @@ def draw(options: Options, results: dict[str, dict[str, Any]], path: str) -> Non
                         3 * i + 0.8 * (j + 1), distance["mean"], 0.8, yerr=distance["std"], color=f"C{j}"
                     )
         axis.set_title(terrain.replace("_", " "), fontsize=10)
-        axis.set_xticks([3 * i + 0.8 for i in range(3)], METHODS, fontsize=8)
+        axis.set_xticks([3 * i + 0.8 for i in range(3)], envs.METHODS, fontsize=8)
     axes[0].set_ylabel(f"distance (m), {engine}; hollow: the paper")
     with whole(path) as temporary:
         figure.savefig(temporary, dpi=100)
@@ -143,10 +143,7 @@ def draw(options: Options, results: dict[str, dict[str, Any]], path: str) -> Non
 def main(arguments: Sequence[str]) -> None:
     """The command line."""
     options = cli.parse(Options, arguments, __doc__ or "")
-    for name in ("json", "markdown", "picture"):
-        folder = Path(getattr(options, name)).absolute().parent
-        if getattr(options, name) and not folder.is_dir():
-            raise ValueError(f"{name}={getattr(options, name)}: there is no folder {folder}")
+    cli.check_folders(options, "json", "markdown", "picture")
     if options.episodes < 1:
         raise ValueError(f"episodes={options.episodes} must be at least 1")
     results = measure(options)

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 import terrains
+from tlq.cli import one_line
 from tlq.session import FASTEST_PUSH, Clip, Session, clip_path
 from tlq.stage import MARKS, Stage
 
@@ -129,7 +130,7 @@ class Page:
         try:
             what()
         except (ValueError, OSError) as error:
-            self.session.news = f"error: {' '.join(str(error).split())}"
+            self.session.news = f"error: {one_line(error)}"
 
     def _draw(self) -> None:
         sim = self.session.sim
@@ -232,7 +233,7 @@ class Page:
         try:
             news = f"wrote {clip.write(name)}"
         except (ValueError, OSError) as error:
-            news = f"error: {' '.join(str(error).split())}"
+            news = f"error: {one_line(error)}"
         self.order(lambda: setattr(self.session, "news", news))
 
     def _marks(self) -> None:
@@ -245,34 +246,27 @@ class Page:
 
     # -- figures
 
+    def _plot(self, title: str, curves: dict[str, str]) -> Any:
+        """A plot over seconds of curves with these names and colours."""
+        uplot = load_viser().uplot
+        series = [uplot.Series(label=name, stroke=colour, width=1.5) for name, colour in curves.items()]
+        return self.gui.add_uplot(
+            (np.zeros(1),) * (1 + len(curves)),
+            (uplot.Series(label="s"), *series),
+            title=title,
+            scales={"x": uplot.Scale(time=False)},
+            aspect=1.7,
+        )
+
     def _figures(self) -> None:
-        viser = load_viser()
         panel = self.gui.add_panel()
         with panel.add_tab("Figures"):
             self._table = self.gui.add_markdown("")
-            empty = np.zeros(1)
-            series, seconds = viser.uplot.Series, {"x": viser.uplot.Scale(time=False)}
-            self._tg_plot = self.gui.add_uplot(
-                (empty, empty, empty),
-                (
-                    series(label="s"),
-                    series(label="δf, Hz", stroke="#2980e6", width=1.5),
-                    series(label="mean δh, cm", stroke="#f27d1a", width=1.5),
-                ),
-                title="trajectory generator",
-                scales=seconds,
-                aspect=1.7,
+            self._tg_plot = self._plot(
+                "trajectory generator", {"δf, Hz": "#2980e6", "mean δh, cm": "#f27d1a"}
             )
-            self._reward_plot = self.gui.add_uplot(
-                (empty, empty, empty),
-                (
-                    series(label="s"),
-                    series(label="speed, m/s", stroke="#33a65a", width=1.5),
-                    series(label="reward", stroke="#a64ac9", width=1.5),
-                ),
-                title="along the command",
-                scales=seconds,
-                aspect=1.7,
+            self._reward_plot = self._plot(
+                "along the command", {"speed, m/s": "#33a65a", "reward": "#a64ac9"}
             )
         panel.dock_left()
         panel.set_width(320)

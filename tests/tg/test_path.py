@@ -106,7 +106,7 @@ def test_stance_runs_backward_at_2fL():
 
 def test_samples_lie_on_the_circles():
     points = np.array(tg.samples.ring_offsets())
-    assert points.shape == (25, 2) and len(tg.samples.RING_OF_POINT) == 25
+    assert points.shape == (25, 2) and tg.samples.COUNT == 25
     start = 0
     for ring, (count, radius) in enumerate([(1, 0.0), (6, 0.03), (8, 0.06), (10, 0.10)]):
         part = points[start : start + count]
@@ -115,8 +115,10 @@ def test_samples_lie_on_the_circles():
         turn = np.unwrap(np.arctan2(part[:, 1], part[:, 0]))
         if count > 1:
             np.testing.assert_allclose(np.diff(turn), 2 * PI / count, atol=1e-9)
-        assert tg.samples.RING_OF_POINT[start : start + count] == (ring,) * count
+        assert tg.samples.circles()[ring] == slice(start, start + count)
         start += count
+        assert tg.samples.within(radius) == slice(0, start)
+        assert tg.samples.within(radius - 0.001) == slice(0, start - count)
 
 
 def test_samples_are_their_own_mirror_image():

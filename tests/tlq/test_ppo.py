@@ -18,7 +18,7 @@ from brax.training.types import Transition
 from jax.sharding import PartitionSpec as P
 
 from tests.tlq.toy import ACTIONS, ToyEnv
-from tlq.loss import LossConfig, ppo_loss
+from tlq.loss import ppo_loss
 from tlq.memory import RecurrentWrapper, carry_size
 from tlq.networks import NetworkConfig, make_networks
 from tlq.ppo import AXIS, Learner, PPOConfig, adapt_learning_rate, hoist, make_mesh, summarise
@@ -270,7 +270,7 @@ def test_the_loss_is_braxs(learner, trained):
     env_state, rollout, _ = rollout_of(learner, state)
     carry, last = state.env_state.obs["carry"], env_state.obs["privileged_state"]
     params = jax.tree.map(lambda x: x + 0.01 * jax.random.normal(KEY, x.shape), state.params)
-    settings = LossConfig(
+    settings = PPOConfig(
         entropy=0.0, discount=0.97, gae_lambda=0.9, clip=0.1, value_loss=0.7, reward_scaling=0.3
     )
 

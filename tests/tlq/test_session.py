@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 import rewards
-import tg
 from tests.tlq.policies import trained
 from tlq import insight, session
 from tlq.render import RenderError
@@ -257,20 +256,20 @@ def test_a_gap_below_a_standing_foot_costs(flat):
     config = flat.sim.config.rewards
     moment = flat.sim.moment()
     below = moment.feet[:, None] - moment.ground
-    near = np.flatnonzero(np.array(tg.samples.RING_OF_POINT) <= 1)
-    below[2, near[:3]] += config.gap_threshold + 0.01
-    measured = {
-        "velocity": np.zeros(3),
-        "turning": np.zeros(3),
-        "command": np.zeros(2),
-        "desired": np.zeros(12),
-        "previous": np.zeros(12),
-        "power": 0.0,
-        "phases": np.ones(4),
-        "lift": np.zeros(4),
-        "rise": np.zeros(4),
-        "below": below,
-        "drift": 0.0,
-    }
-    terms = insight.weighted_terms(config, measured)
+    below[2, :3] += config.gap_threshold + 0.01
+    step = rewards.Step(
+        velocity=np.zeros(2),
+        angular_velocity=np.zeros(3),
+        command=np.zeros(2),
+        desired=np.zeros(12),
+        previous=np.zeros(12),
+        energy=0.0,
+        swing=np.ones(4, bool),
+        near=below[:, :7],
+        highest=below.min(axis=1),
+        lift=np.zeros(4),
+        rise=np.zeros(4),
+        drift=0.0,
+    )
+    terms = insight.weighted_terms(config, step)
     assert float(terms["terrain"]) == pytest.approx(-config.terrain * 3 / 7 / 4)
