@@ -215,6 +215,7 @@ def test_train_py_from_the_command_line(tmp_path):
         "env.terrain.num_terrains=12",
         "num_envs=8",
         "ppo.unroll=4",
+        "ppo.minibatches=2",
         f"run={tmp_path / 'run'}",
     ]
     for arguments in (["steps=64", *small], [f"run={tmp_path / 'run'}", "resume=true", "steps=96"]):
