@@ -394,7 +394,6 @@ def main(arguments: Sequence[str]) -> None:
     """The command line."""
     options = parse(Options, arguments, __doc__ or "")
     check(options)
-    signal.signal(signal.SIGTERM, _stop)  # ends both processes, as Ctrl-C does
     if options.role == "policy":
         serve(options)
         return
@@ -408,4 +407,5 @@ def main(arguments: Sequence[str]) -> None:
 
 
 if __name__ == "__main__":
+    signal.signal(signal.SIGTERM, _stop)  # ends both processes, as Ctrl-C does
     run(main)

@@ -155,10 +155,18 @@ class Supervisor:
                 self.controller.reset()
                 self.mode = Mode.WALK
         elif fresh:
+            if self.mode is Mode.STAND and not self.controller.state.gate > 0:
+                self._start_again()
             self.mode = Mode.WALK
         else:  # half a period more: calls don't come at exact times
             held = silence <= c.grace + 0.5 * self.controller.control_dt
             self.mode = Mode.HOLD if held else Mode.STAND
+
+    def _start_again(self) -> None:
+        """The gait was faded out: it starts as it always does, not from wherever in its cycle it was stopped."""
+        turn = self.controller.state.turn
+        self.controller.reset()
+        self.controller.state = self.controller.state._replace(turn=turn)
 
     def _wanted(self, message: Sensing) -> np.ndarray:
         """Desired joint angles (12,) rad, before the limit of their change."""

@@ -176,6 +176,18 @@ def test_it_recovers(file, missing):
     assert rig.supervisor.controller.state.gate == 1.0  # walking, not only allowed to
 
 
+def test_after_standing_the_gait_starts_as_it_always_does(file):
+    rig = Rig(file).walk(37)
+    controller = rig.supervisor.controller
+    controller.state = controller.state._replace(turn=np.float32(0.2))
+    for _ in range(20):
+        rig.step(None)
+    assert rig.mode is Mode.STAND and controller.state.gate == 0.0
+    rig.step(rig.message(command=STILL))
+    assert controller.state.phase == pytest.approx(0.5 * np.pi)  # every foot in the middle of its step
+    assert controller.state.turn == pytest.approx(0.2, abs=1e-6)  # the heading to keep is the old one
+
+
 def test_before_the_first_good_message_nothing_is_commanded(file):
     rig = Rig(file)
     for message in (None, rig.message(orientation=np.zeros(4)), rig.message(time=0)):
