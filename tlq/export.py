@@ -1,7 +1,10 @@
-"""Exports a policy into one npz file: `python -m tlq.export run=runs/NAME out=FILE`; FILE.onnx gives the bare network.
+"""Exports a policy into one npz file, or the bare network to ONNX.
 
-The file holds `graph` (JSON, see `tlq.graph`), `metadata` (JSON, see `describe`) and the initialisers, which have the
-names of the parameters in a checkpoint. `tlq.runtime` reads it.
+    python -m tlq.export run=runs/NAME out=FILE.npz      # or FILE.onnx: a run's newest checkpoint
+    python -m tlq.export policy=FILE.npz out=FILE.onnx   # an exported policy, or the name of a shipped one
+
+The npz file holds `graph` (JSON, see `tlq.graph`), `metadata` (JSON, see `describe`) and the initialisers, which have
+the names of the parameters in a checkpoint. `tlq.runtime` reads it.
 """
 
 import dataclasses
@@ -16,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from tlq.cli import option, parse, run
+from tlq.cli import UsageError, find_policy, option, parse, run
 from tlq.files import whole
 from tlq.graph import INPUTS, OUTPUTS, Graph
 from tlq.runtime import FORMAT, VERSION, load_policy
@@ -352,18 +355,38 @@ def export_run(folder: str | os.PathLike[str], out: str | os.PathLike[str]) -> N
         write_onnx(out, npz)
 
 
+def convert(policy: str, out: str | os.PathLike[str]) -> None:
+    """Converts an exported policy, by its file or name, to ONNX; `out` is written whole or not at all."""
+    out = Path(out)
+    if out.suffix != ".onnx":
+        raise ValueError(f"out={out} must end in .onnx: policy= is an npz file already")
+    source = find_policy(policy)
+    load_policy(source)  # refuses a bad file before anything is made
+    out.parent.mkdir(parents=True, exist_ok=True)
+    with whole(out) as temporary:
+        write_onnx(temporary, source)
+
+
 @dataclasses.dataclass(frozen=True)
 class Options:
     """What a user may set."""
 
-    run: str = option("", "folder of the run", required=True)
+    run: str = option("", "folder of a run, whose newest checkpoint is exported")
+    policy: str = option("", "or an exported policy's file, run folder, or name, to convert to .onnx")
     out: str = option("", "file to write, .npz or .onnx", required=True)
 
 
 def main(arguments: Sequence[str]) -> None:
     """Command line."""
     options = parse(Options, arguments, __doc__ or "")
-    export_run(options.run, options.out)
+    if bool(options.run) == bool(options.policy):
+        raise UsageError(
+            "give one of run= (a run's folder) and policy= (an exported policy), not both or none"
+        )
+    if options.run:
+        export_run(options.run, options.out)
+    else:
+        convert(options.policy, options.out)
     print(f"wrote {options.out}")
 
 

@@ -14,7 +14,7 @@ from tlq.simulation import Simulation
 def sample_points(sim: Simulation) -> np.ndarray:
     """The terrain's points (L, P, 3) m that the policy sees."""
     core = sim.controller.core
-    flat = core.sample_points(core.feet(sim.sensors()))
+    flat = core.sample_points(core.feet(sim.exact_sensors()))
     flat = sim.data.qpos[:2] + tg.frames.turn(np.asarray(sim.yaw), flat)
     return np.concatenate([flat, sim.moment().ground[..., None]], axis=-1)
 
@@ -22,7 +22,7 @@ def sample_points(sim: Simulation) -> np.ndarray:
 def feet(sim: Simulation) -> np.ndarray:
     """Where the feet's centres (L, 3) m are."""
     geometry = sim.controller.core.geometry
-    return _world(sim, tg.leg.forward(geometry, sim.sensors().joint_position.reshape(4, 3)))
+    return _world(sim, tg.leg.forward(geometry, sim.exact_sensors().joint_position.reshape(4, 3)))
 
 
 def desired_feet(sim: Simulation) -> np.ndarray:
@@ -35,7 +35,7 @@ def desired_feet(sim: Simulation) -> np.ndarray:
 
 def foot_paths(sim: Simulation, count: int = 24) -> np.ndarray:
     """The closed paths (L, count, 3) m that the trajectory generator would lead the feet along, as it is set now."""
-    core, state, sensors = sim.controller.core, sim.controller.state, sim.sensors()
+    core, state, sensors = sim.controller.core, sim.controller.state, sim.exact_sensors()
     lift = state.lift * state.gate
     phases = np.linspace(-np.pi, np.pi, count, dtype=np.float32)
     targets = [core.foot_targets(np.full(4, p), lift, state.stride, sensors) for p in phases]

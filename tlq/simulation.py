@@ -68,14 +68,14 @@ class Simulation:
         if self.noise is not None:
             drift = np.array([self.noise.map_drift, self.noise.map_drift, self.noise.height_drift])
             self._offset = drift * self._random.uniform(-1.0, 1.0, 3)
-        self._look()
+        self.look()
 
     def step(self, direction: np.ndarray) -> Moment:
         """One control period, towards a direction (2,) in the world (a unit vector; 0: stand)."""
         command = tg.frames.turn(np.asarray(-self.yaw), np.asarray(direction, float))
-        desired = self.controller.step(self._sensors, self._heights, command)
-        work = sum(self._physics(desired) for _ in range(self.substeps))
-        self._look()
+        desired = self.controller.step(self.sensors, self.heights, command)
+        work = sum(self.substep(desired) for _ in range(self.substeps))
+        self.look()
         return self.moment(work)
 
     def moment(self, work: float = 0.0) -> Moment:
@@ -90,7 +90,7 @@ class Simulation:
             fell=np.asarray(self.fell()),
         )
 
-    def sensors(self) -> tg.Sensors:
+    def exact_sensors(self) -> tg.Sensors:
         """What the robot would measure without errors."""
         return tg.Sensors(
             orientation=self.data.qpos[3:7].copy(),
@@ -116,7 +116,7 @@ class Simulation:
         hit = points[:, 2] < exact_height(self.terrain, points[:, :2])
         return bool(hit.any() or rotation[2, 2] < self.config.min_up)
 
-    def _physics(self, desired: np.ndarray) -> float:
+    def substep(self, desired: np.ndarray) -> float:
         """One timestep under PD control; returns sum of |torque x speed| dt (J)."""
         c, data, limit = self.controller, self.data, self.controller.torque_limit
         speed = data.qvel[self._v]
@@ -125,18 +125,18 @@ class Simulation:
         mujoco.mj_step(self.model, data)
         return float(np.abs(torque) @ np.abs(speed)) * self.model.opt.timestep
 
-    def _look(self) -> None:
+    def look(self) -> None:
         """Reads sensors, and the terrain at the feet: as it is, and as it is perceived."""
-        data, core, exact = self.data, self.controller.core, self.sensors()
+        data, core, exact = self.data, self.controller.core, self.exact_sensors()
         self._feet = core.feet(exact)
         points = core.sample_points(self._feet)
         self._ground = self._height(points)
-        self._sensors, self._heights = exact._asdict(), self._ground - data.qpos[2]
+        self.sensors, self.heights = exact._asdict(), self._ground - data.qpos[2]
         if self.noise is not None:
-            self._sensors = noisy(self._sensors, self.noise, self._random)
-            points = self.controller.sample_points(self._sensors) + self._offset[:2]
+            self.sensors = noisy(self.sensors, self.noise, self._random)
+            points = self.controller.sample_points(self.sensors) + self._offset[:2]
             error = self.noise.height_noise * self._random.standard_normal(points.shape[:-1])
-            self._heights = self._height(points) - data.qpos[2] + self._offset[2] + error
+            self.heights = self._height(points) - data.qpos[2] + self._offset[2] + error
 
     def _height(self, points: np.ndarray) -> np.ndarray:
         """Terrain height (...) m in the world at points (..., 2) m of the heading frame."""

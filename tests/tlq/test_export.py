@@ -105,6 +105,26 @@ def test_onnx_gives_the_same(memory, tmp_path):
     assert json.loads(session.get_modelmeta().custom_metadata_map["metadata"]) == policy.metadata
 
 
+@pytest.mark.parametrize(("method", "memory"), [("ours", "mingru"), ("ours", "gru"), ("blind", "mingru")])
+def test_onnx_stays_with_the_runtime_for_a_thousand_steps(method, memory, tmp_path):
+    """Each carries its own memory along, so that differences could add up."""
+    onnxruntime = pytest.importorskip("onnxruntime")
+    npz = trained(method, memory).export(tmp_path / "policy.npz")
+    tlq.export.main([f"policy={npz}", f"out={tmp_path / 'policy.onnx'}"])
+    session = onnxruntime.InferenceSession(tmp_path / "policy.onnx", providers=["CPUExecutionProvider"])
+    policy, rng = load_policy(npz), np.random.default_rng(5)
+    memories = [np.zeros(policy.memory_size, np.float32)] * 2
+    observation = np.zeros(policy.core.observation_size, np.float32)
+    for _ in range(1000):
+        observation = (0.9 * observation + 0.4 * rng.normal(size=observation.size)).astype(np.float32)
+        got = session.run(["action", "memory_out"], {"observation": observation, "memory": memories[0]})
+        wanted = policy.graph(observation, memories[1])
+        for one, other in zip(got, wanted, strict=True):
+            np.testing.assert_allclose(one, other, rtol=0, atol=1e-5)
+        memories = [got[1], wanted[1]]
+    assert np.abs(memories[0]).max() > 0.01  # the memory was in use
+
+
 def test_training_starts_from_a_file(file, made, capsys):
     import flax
 
@@ -165,12 +185,19 @@ def test_graphs_that_make_no_sense_are_refused(change, message):
 
 
 def test_command_line(tmp_path):
-    with pytest.raises(UsageError, match="unknown setting 'rum' .did you mean run.*; choose one of run, out"):
+    with pytest.raises(UsageError, match="unknown setting 'rum' .did you mean run.*; choose one of run, pol"):
         tlq.export.main(["rum=x"])
     with pytest.raises(UsageError, match="out= is missing"):
         tlq.export.main(["run=x"])
     with pytest.raises(ValueError, match="must end in .npz or .onnx"):
         tlq.export.main(["run=x", "out=y"])
+    for arguments in (["out=y.onnx"], ["run=x", "policy=x", "out=y.onnx"]):
+        with pytest.raises(UsageError, match="give one of run= .* and policy= "):
+            tlq.export.main(arguments)
+    with pytest.raises(ValueError, match="out=y.npz must end in .onnx: policy= is an npz file already"):
+        tlq.export.main(["policy=x", "out=y.npz"])
+    with pytest.raises(UsageError, match="policy=nobody: no such policy"):
+        tlq.export.main(["policy=nobody", "out=y.onnx"])
     command = [sys.executable, "-m", "tlq.export", f"run={tmp_path}", "out=y.npz"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 2 and done.stderr.splitlines() == [
