@@ -3,9 +3,9 @@
     python -m benchmarks.footholds policy=flat difficulty=0.5 reflex=false
     python -m benchmarks.footholds policy=flat difficulty=0.5 reflex=true depth=0.5 json=FILE
 
-The reflex looks, for each foot in swing, for the nearest ground without a gap round the point where the foot will come
-down, and leads the foot there by inverse kinematics, on top of the policy's residual joint angles: a share of the way
-at each step, kept until the next swing. It knows the true map. What it reaches shows what residual joint angles can do.
+The reflex follows the guide (envs/guide.py): for each foot in swing it looks for the nearest ground without a gap round
+the point where the foot will come down, and leads the foot there by inverse kinematics, on top of the policy's residual
+joint angles: a share of the way at each step, kept until the next swing. It knows the true map.
 
 Episodes as in training, in MJX, on terrains that training never saw: noise and randomisation but no pushes, all walk;
 an episode ends with a foot in a gap, a fall, or at 5 m.
@@ -29,15 +29,12 @@ import envs  # noqa: E402
 import terrains  # noqa: E402
 import tg  # noqa: E402
 from benchmarks import timing  # noqa: E402
+from envs import guide  # noqa: E402
 from tlq import cli  # noqa: E402
 from tlq import config as settings  # noqa: E402
 from tlq.evaluate import FIRST_SEED, training_env  # noqa: E402
 from tlq.runtime import Policy, load_policy  # noqa: E402
 
-REACH = 0.1
-"""Farthest that a foot is led away (m)."""
-GRID = np.stack(np.meshgrid(*[np.arange(-4, 5) * 0.02] * 2, indexing="ij"), axis=-1).reshape(-1, 2)
-"""(81, 2) m, displacements that are compared."""
 DROP = 0.6
 """Phase (rad) up to which a foot that lifts off forgets where it was led, by a tenth each step."""
 
@@ -51,7 +48,7 @@ class Options:
     difficulty: float = cli.option(0.5, "in [0, 1]")
     depth: float = cli.option(0.02, "of the pits for the feet (m)")
     reflex: bool = cli.option(False, "lead the feet by the reflex")
-    gain: float = cli.option(0.3, "share of the way to the best foothold at each step")
+    gain: float = cli.option(guide.GAIN, "share of the way to the best foothold at each step")
     robots: int = cli.option(96, "episodes, two on each terrain")
     seconds: float = cli.option(8.0, "longest episode")
     json: str = cli.option("", "file for the result")
@@ -77,19 +74,8 @@ def make_env(policy: Policy, options: Options) -> envs.QuadrupedEnv:
 
 def lead(env: envs.QuadrupedEnv, episode: envs.Episode, led: jax.Array, gain: float) -> jax.Array:
     """Where the reflex leads the feet: displacements (L, 2) m in the heading frame, from those of the step before."""
-    near = jnp.asarray(tg.samples.ring_offsets()[tg.samples.within(0.03)], jnp.float32)
-    landing = env.landing_points(episode)[:, None, None] + GRID[:, None] + near
-    heights = env._heights(episode, landing) + episode.qpos[2]
-    _, around = env._terrain_at_feet(episode)
-    highest = jnp.maximum(jnp.max(around, axis=1), jnp.max(heights, axis=(1, 2)))[:, None, None]
-    gaps = jnp.mean(highest - heights > env.config.rewards.gap_threshold, axis=-1)
-    there = led[:, None] + GRID
-    beyond = jnp.maximum(jnp.max(jnp.abs(there), axis=-1) - 0.9 * REACH, 0.0)
-    # A gap counts most; then the shorter way, and the place nearer to the trajectory generator's path.
-    cost = gaps + 0.5 * np.linalg.norm(GRID, axis=-1) + jnp.linalg.norm(there, axis=-1) + 10.0 * beyond
-    best = jnp.asarray(GRID, jnp.float32)[jnp.argmin(cost, axis=1)]
+    led = jnp.clip(led + gain * guide.ways(env, episode), -guide.LIMIT, guide.LIMIT)
     phases = tg.path.leg_phases(episode.controller.phase)[:, None]
-    led = jnp.where(phases > 0, jnp.clip(led + gain * best, -REACH, REACH), led)
     return jnp.where((phases > 0) & (phases < DROP), 0.9 * led, led)
 
 

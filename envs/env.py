@@ -263,7 +263,7 @@ class QuadrupedEnv(Env):
     def observe(self, episode: Episode) -> dict[str, jax.Array]:
         """The observations of policy and critic."""
         sensors, command = self.sense(episode), self.heading_command(episode)
-        points = self.core.sample_points(self.core.feet(sensors))
+        points = self.core.sample_points(episode.controller, sensors)
         true = seen = self._heights(episode, points)
         if self.config.randomisation.enabled and self.core.heights:
             offset = episode.randomised.map_offset
@@ -402,7 +402,7 @@ class QuadrupedEnv(Env):
     def _terrain_at_feet(self, episode: Episode) -> tuple[jax.Array, jax.Array]:
         """z_ij (L, P) m, foot height minus terrain height; terrain heights (L, P) m in the world."""
         feet = self.core.feet(exact_sensors(episode))
-        heights = self._heights(episode, self.core.sample_points(feet))
+        heights = self._heights(episode, self.core.around(feet))
         return feet[:, 2:] - heights, heights + episode.qpos[2]
 
     def _reward_terms(
@@ -426,22 +426,9 @@ class QuadrupedEnv(Env):
         return rewards.step_terms(c, step) | {"aim": jnp.mean(self._aim(after, around))}
 
     def landing_points(self, episode: Episode) -> jax.Array:
-        """Where the feet (L, 2) m in swing will come down, from the trunk's centre, heading frame.
-
-        The end of the trajectory generator's step, the trunk's way until then at its present velocity, and the
-        displacement by the residual joint angles, which are taken to stay as they are.
-        """
-        controller, sensors = episode.controller, exact_sensors(episode)
-        phases = tg.path.leg_phases(controller.phase)
-        level = tg.frames.heading_from_trunk(tg.frames.up_in_trunk(sensors.orientation))
-        target = self.core.foot_targets(phases, controller.lift * controller.gate, controller.stride, sensors)
-        displacement = (controller.targets[0].reshape(4, 3) - target) @ level.T
-        hips = jnp.asarray(self.core.geometry.hip_position) @ level.T
-        step = hips + self.core.base_foot + displacement
-        time_left = jnp.maximum(jnp.pi - phases, 0.0) / (2.0 * jnp.pi * controller.frequency)
+        """Where the feet (L, 2) m in swing will come down, from the trunk's centre, heading frame: `Core`'s, exact."""
         velocity = tg.frames.turn(-tg.frames.yaw(episode.qpos[3:7]), episode.qvel[:2])
-        end = 0.5 * self.core.config.step_length * controller.stride
-        return step[:, :2] + end + time_left[:, None] * velocity
+        return self.core.landing_points(episode.controller, exact_sensors(episode), velocity)
 
     def _aim(self, episode: Episode, around: jax.Array) -> jax.Array:
         """Minus the share (L,) of low points where a foot in swing will come down; 0 in stance.

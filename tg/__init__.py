@@ -1,12 +1,13 @@
 """The controller core: trajectory generator, leg kinematics, observation. Runs under JAX and under NumPy alike."""
 
 from tg import frames, leg, path, samples
-from tg.config import TGConfig
+from tg.config import BEFORE, TGConfig
 from tg.core import ACTION_SIZE, ControllerState, Core, Sensors
 from tg.leg import LegGeometry
 
 __all__ = [
     "ACTION_SIZE",
+    "BEFORE",
     "ControllerState",
     "Core",
     "LegGeometry",

@@ -2,6 +2,9 @@
 
 import dataclasses
 
+BEFORE = {"look_ahead": False}
+"""Settings of policies from before there was such a setting."""
+
 
 @dataclasses.dataclass(frozen=True)
 class TGConfig:
@@ -41,3 +44,6 @@ class TGConfig:
     """Let the policy see a command to the right as its mirror image to the left: halves what it has to learn."""
     mirror_hysteresis: float = 0.15
     """The mirror flips when the command's lateral part passes this far to the other side."""
+    look_ahead: bool = True
+    """Sample the terrain round the place where a foot in swing will come down; false: round the foot, as the paper
+    does, so that the policy sees a foothold only when the foot is nearly there."""

@@ -7,6 +7,7 @@ abduction, hip, knee), P = 25 sample points a foot, S = size of the observation.
 
 import dataclasses
 import functools
+import math
 from typing import Any, NamedTuple
 
 from tg import frames, leg, path, samples
@@ -23,6 +24,12 @@ HEIGHT_CLIP = 0.25
 """Heights below the foot are cut to ± this (m): deeper than that, a hole is a hole."""
 TURN_CLIP = 0.5
 """The turn since the start is shown up to ± this (rad), so that a robot turned round by hand sees nothing new."""
+EARLY = 0.09
+"""Feet come down this share of the step before its end: measured, docs/experiments.md."""
+LAG = 0.07
+"""Time constant (s) with which joints catch up with what is asked of them: measured, too."""
+SMOOTHING = 0.3
+"""Share of a new measurement in the velocity that the stance legs tell of."""
 
 _MIRRORED_LEG = (1, 0, 3, 2)
 
@@ -63,6 +70,8 @@ class ControllerState(NamedTuple):
     """(12,) rad, last desired joint angles."""
     turn: Array
     """() rad, heading since the start by the integrated gyro, left positive, in [-π, π)."""
+    velocity: Array
+    """(2,) m/s, the trunk's by the motion of the stance legs, heading frame."""
 
 
 def _layout(heights: bool) -> tuple[tuple[str, int], ...]:
@@ -137,6 +146,7 @@ class Core:
             targets=xp.stack([targets] * TARGET_HISTORY),
             desired=xp.asarray(self.standing_target, dtype=phase.dtype),
             turn=zero,
+            velocity=xp.zeros((2,), dtype=phase.dtype),
         )
 
     def feet(self, sensors: Sensors) -> Array:
@@ -146,13 +156,67 @@ class Core:
         in_trunk = self.geometry.hip_position + leg.forward(self.geometry, q)
         return in_trunk @ frames.heading_from_trunk(frames.up_in_trunk(sensors.orientation)).T
 
-    def sample_points(self, feet: Array) -> Array:
-        """Points (4, 25, 2) m at which the terrain's height is wanted, from the trunk's centre, heading frame.
+    def sample_points(self, state: ControllerState, sensors: Sensors) -> Array:
+        """Points (4, 25, 2) m at which the terrain's height is wanted, from the trunk's centre, heading frame."""
+        return self.around(self.centres(state, sensors))
 
-        Args:
-          feet: (4, 3) m, of `feet`.
+    def centres(self, state: ControllerState, sensors: Sensors) -> Array:
+        """Centres (4, 2) m of the circles of `sample_points`: the feet, or where those in swing land (`look_ahead`)."""
+        feet = self.feet(sensors)[:, :2]
+        if not self.config.look_ahead:
+            return feet
+        xp = feet.__array_namespace__()
+        landing = self.landing_points(state, sensors, self.odometry(state, sensors))
+        # A robot that stands still has feet in swing by their phase, but they stay where they are.
+        share = xp.where(path.leg_phases(state.phase) > 0, state.gate, 0.0 * state.gate)[:, None]
+        return feet + share * (landing - feet)
+
+    def around(self, centres: Array) -> Array:
+        """The points (4, 25, 2) m of the circles round places (4, 2 or 3) m."""
+        return centres[:, None, :2] + self._ring_offsets
+
+    def odometry(self, state: ControllerState, sensors: Sensors) -> Array:
+        """The trunk's velocity (2,) m/s in the heading frame, by the legs in stance, smoothed over a few steps.
+
+        A foot that carries weight is taken to stand still: the trunk moves against it by what joints and gyro say.
         """
-        return feet[:, None, :2] + self._ring_offsets
+        xp = sensors.joint_position.__array_namespace__()
+        q, speed = (xp.reshape(x, (4, 3)) for x in (sensors.joint_position, sensors.joint_velocity))
+        moment = 0.01  # s; long enough for single precision
+        now, then = leg.forward(self.geometry, xp.stack([q, q + moment * speed]))
+        share = load_share(path.leg_phases(state.phase), state.gate)
+        x, y, z = share @ (self.geometry.hip_position + now)
+        a, b, c = sensors.angular_velocity
+        turned = stack([b * z - c * y, c * x - a * z, a * y - b * x])
+        velocity = -(share @ (then - now) / moment + turned)
+        level = frames.heading_from_trunk(frames.up_in_trunk(sensors.orientation))
+        return state.velocity + SMOOTHING * ((level @ velocity)[:2] - state.velocity)
+
+    def residual_displacement(self, state: ControllerState, sensors: Sensors) -> Array:
+        """How far residual joint angles lead the feet (4, 3) m from the trajectory generator's, heading frame."""
+        xp = state.targets.__array_namespace__()
+        phases = path.leg_phases(state.phase)
+        target = self.foot_targets(phases, state.lift * state.gate, state.stride, sensors)
+        level = frames.heading_from_trunk(frames.up_in_trunk(sensors.orientation))
+        return (xp.reshape(state.targets[0], (4, 3)) - target) @ level.T
+
+    def landing_points(self, state: ControllerState, sensors: Sensors, velocity: Array) -> Array:
+        """Where feet in swing will come down: (4, 2) m from the trunk's centre, heading frame.
+
+        The end of the trajectory generator's step less EARLY, the trunk's way until then at its velocity (2,) m/s, the
+        displacement by the residual joint angles, which are taken to stay as they are, and what will be left of the
+        joints' lag.
+        """
+        xp = state.targets.__array_namespace__()
+        phases = path.leg_phases(state.phase)
+        level = frames.heading_from_trunk(frames.up_in_trunk(sensors.orientation))
+        hips = self.geometry.hip_position @ level.T
+        time_left = xp.maximum(math.pi - phases, 0.0 * phases) / (2.0 * math.pi * state.frequency)
+        end = (0.5 - EARLY) * self.config.step_length * state.stride
+        lag = self.feet(sensors) - hips - xp.reshape(state.targets[0], (4, 3)) @ level.T
+        left = xp.exp(-(time_left + self.dt) / LAG)[:, None] * lag
+        place = hips + self.base_foot + self.residual_displacement(state, sensors) + left
+        return place[:, :2] + end + time_left[:, None] * velocity
 
     def observe(
         self, state: ControllerState, sensors: Sensors, heights: Array | None, command: Array
@@ -228,6 +292,7 @@ class Core:
             self.geometry, wanted, c.weight_compensation * self.sag * load_share(phases, gate)
         )
         desired = xp.clip(xp.reshape(wanted + sag, (12,)), self.lower, self.upper)
+        velocity = self.odometry(state, sensors) if c.look_ahead else state.velocity
         rate = frames.yaw_rate(frames.up_in_trunk(sensors.orientation), sensors.angular_velocity)
         state = ControllerState(
             phase=phase,
@@ -240,6 +305,7 @@ class Core:
             targets=stack([xp.reshape(reached, (12,)), *state.targets[: TARGET_HISTORY - 1]], axis=-2),
             desired=desired,
             turn=path.wrap(state.turn + self.dt * rate),
+            velocity=velocity,
         )
         return state, desired
 

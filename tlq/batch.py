@@ -141,7 +141,7 @@ def _moment(env: envs.QuadrupedEnv, episode: envs.Episode) -> judge.Moment:
     """The episode's present state, as the judge sees it; work is taken from the last substep."""
     feet = env.core.feet(exact_sensors(episode))
     yaw = tg.frames.yaw(episode.qpos[3:7])
-    points = episode.qpos[:2] + tg.frames.turn(yaw, env.core.sample_points(feet))
+    points = episode.qpos[:2] + tg.frames.turn(yaw, env.core.around(feet))
     power = jnp.sum(jnp.abs(episode.torque * episode.qvel[6:]))
     return judge.Moment(
         position=episode.qpos[:2],

@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import tg
 from envs.config import METHODS
 from tlq.cli import UsageError, unknown
 from tlq.files import whole
@@ -53,6 +54,7 @@ LIMITS: dict[str, tuple[float, float]] = {
     "ppo.value_loss": (0.0, 1e3),
     "ppo.max_grad_norm": (1e-6, 1e6),
     "ppo.reward_scaling": (1e-6, 1e6),
+    "ppo.guide": (0.0, 1e3),
 }
 """Limits of the numbers outside of `env` (those have theirs in `envs.limits`), both ends included."""
 
@@ -374,7 +376,7 @@ def load_config(path: Path) -> TrainConfig:
         # Merged into the schema, which gives every value its type.
         schema = OmegaConf.structured(default_config())
         _writable(schema)
-        found = OmegaConf.load(path)
+        found = OmegaConf.merge({"env": {"tg": tg.BEFORE}}, OmegaConf.load(path))
         return build(TrainConfig, OmegaConf.to_container(OmegaConf.merge(schema, found)))
     except (
         OmegaConfBaseException,

@@ -121,7 +121,8 @@ class PolicyServer:
             return
         sent = time.monotonic_ns()
         mode = int(self.supervisor.mode)
-        answer = Targets(self.ticks, sent, last.sequence, last.time, mode, desired)
+        centres = self.supervisor.centres()
+        answer = Targets(self.ticks, sent, last.sequence, last.time, mode, desired, centres)
         try:
             self.socket.sendto(answer.pack(), self.robot)
         except OSError:
@@ -189,6 +190,7 @@ class Robot:
         self.socket.connect(tuple(address))
         self.socket.setblocking(False)
         self.desired = np.array(simulation.controller.core.standing_target, float)
+        self.centres = np.full((4, 2), np.nan)
         self.sent = self.received = self.refused = self.newest = 0
         self.distance, self.fell = 0.0, False
         self.periods, self.late, self.trips, self.waits = (
@@ -236,7 +238,7 @@ class Robot:
 
     def _sense(self) -> None:
         sim, now = self.sim, time.monotonic_ns()
-        sim.look()
+        sim.look(self.centres)
         position = sim.data.qpos[:2] @ self.direction
         self.distance, self.fell = max(self.distance, float(position)), sim.fell()
         command = self.direction if self.distance < GOAL else 0.0 * self.direction
@@ -262,6 +264,7 @@ class Robot:
                 self.refused += 1
                 continue
             came, self.newest, self.desired = True, message.sequence, message.desired
+            self.centres = message.centres
             self.received += 1
             if message.mode == Mode.WALK:
                 self.trips.append(time.monotonic() - 1e-9 * message.answers_time)

@@ -21,6 +21,7 @@ import numpy as np
 
 import envs
 import terrains
+import tg
 from tlq import judge
 from tlq.cli import check_folders, find_policy, option, parse, run
 from tlq.config import build
@@ -97,7 +98,8 @@ def start_phase(k: int) -> float:
 
 def training_env(metadata: dict[str, Any]) -> envs.EnvConfig:
     """The environment a policy was trained in."""
-    return build(envs.EnvConfig, metadata["training"]["env"])
+    env = metadata["training"]["env"]
+    return build(envs.EnvConfig, env | {"tg": tg.BEFORE | env["tg"]})
 
 
 def _walk_mjx(options: Options, path: Path, metadata: dict[str, Any], report: Any) -> list[judge.Tally]:

@@ -8,15 +8,14 @@ import numpy as np
 
 import rewards
 import tg
+from terrains import exact_height
 from tlq.simulation import Simulation
 
 
 def sample_points(sim: Simulation) -> np.ndarray:
     """The terrain's points (L, P, 3) m that the policy sees."""
-    core = sim.controller.core
-    flat = core.sample_points(core.feet(sim.exact_sensors()))
-    flat = sim.data.qpos[:2] + tg.frames.turn(np.asarray(sim.yaw), flat)
-    return np.concatenate([flat, sim.moment().ground[..., None]], axis=-1)
+    flat = sim.data.qpos[:2] + tg.frames.turn(np.asarray(sim.yaw), sim.points)
+    return np.concatenate([flat, exact_height(sim.terrain, flat)[..., None]], axis=-1)
 
 
 def feet(sim: Simulation) -> np.ndarray:

@@ -70,7 +70,8 @@ def ppo_loss(
     value_loss = 0.5 * config.value_loss * jnp.mean(jnp.square(targets - values))
     by_env = jax.vmap(lambda p, key: distribution.entropy({"action": p}, key), in_axes=(1, 0), out_axes=1)
     entropy_loss = -config.entropy * jnp.mean(by_env(parameters["action"], keys))
-    total = policy_loss + value_loss + entropy_loss
+    guide_loss = _guide_loss(rollout, parameters["action"]) if rollout.guide.shape[-1] else jnp.float32(0)
+    total = policy_loss + value_loss + entropy_loss + config.guide * guide_loss
 
     new = distribution.create_dist(parameters)
     kl = jnp.mean(new.kl_divergence(distribution.create_dist({"action": rollout.parameters})))
@@ -79,7 +80,19 @@ def ppo_loss(
         "policy": policy_loss,
         "value": value_loss,
         "entropy": entropy_loss,
+        "guide": guide_loss,
         "kl": kl,
         "std": jnp.mean(new.scale),
         "std_max": jnp.max(new.scale),
     }
+
+
+def _guide_loss(rollout: Rollout, parameters: jax.Array) -> jax.Array:
+    """Mean square distance (), summed over the angles, of the mean action from what the guide made of the old one.
+
+    Only where the guide asks for something. parameters: (T, B, 2 A), of the new policy.
+    """
+    mean, old = (jnp.tanh(jnp.split(p, 2, axis=-1)[0]) for p in (parameters, rollout.parameters))
+    wanted = jnp.clip(old + rollout.guide, -0.95, 0.95)
+    asked = jnp.abs(rollout.guide) > 0
+    return jnp.mean(jnp.sum(jnp.where(asked, jnp.square(mean - wanted), 0.0), axis=-1))

@@ -15,7 +15,7 @@ from typing import ClassVar
 import numpy as np
 
 MAGIC = b"TLQM"
-VERSION = 1
+VERSION = 2
 LARGEST = 2048
 """Bytes to read at most; every message is shorter, and stays one Ethernet packet."""
 
@@ -58,7 +58,8 @@ class Sensing:
     command: np.ndarray
     """(2,) unit vector in the heading frame, or 0 to stand."""
     heights: np.ndarray
-    """(4, 25) m, as `Controller.step` takes them; a blind policy doesn't look at them."""
+    """(4, 25) m, as `Controller.step` takes them, at the points round the last `Targets.centres`; a blind policy
+    doesn't look at them."""
 
     def pack(self) -> bytes:
         """The message's bytes; raises ValueError where an array has another shape."""
@@ -95,18 +96,23 @@ class Targets:
     """`tlq.supervisor.Mode`."""
     desired: np.ndarray
     """(12,) rad, for the joints' PD controllers."""
+    centres: np.ndarray
+    """(4, 2) m, heading frame, from the trunk's centre: round these places the next message's heights are wanted. NaN:
+    round the foot."""
 
     def pack(self) -> bytes:
-        """The message's bytes; raises ValueError where `desired` has another shape."""
-        desired = np.asarray(self.desired, "<f4")
-        if desired.shape != (12,):
-            raise ValueError(f"desired has shape {desired.shape}; expected (12,)")
+        """The message's bytes; raises ValueError where an array has another shape."""
+        desired, centres = (np.asarray(x, "<f4") for x in (self.desired, self.centres))
+        if desired.shape != (12,) or centres.shape != (4, 2):
+            shapes = f"desired has shape {desired.shape}, centres {centres.shape}"
+            raise ValueError(f"{shapes}; expected (12,) and (4, 2)")
         answer = _ANSWER.pack(self.answers, self.answers_time, self.mode)
-        return _frame(self.KIND, self.sequence, self.time, answer + desired.tobytes())
+        body = answer + desired.tobytes() + centres.tobytes()
+        return _frame(self.KIND, self.sequence, self.time, body)
 
 
 _NUMBERS = sum(int(np.prod(shape)) for shape in Sensing.FIELDS.values())
-_BODY = {Sensing.KIND: 4 * _NUMBERS, Targets.KIND: _ANSWER.size + 4 * 12}
+_BODY = {Sensing.KIND: 4 * _NUMBERS, Targets.KIND: _ANSWER.size + 4 * (12 + 8)}
 
 
 def unpack(data: bytes) -> Sensing | Targets:
@@ -125,9 +131,9 @@ def unpack(data: bytes) -> Sensing | Targets:
     body = data[_HEAD.size : -_CHECK.size]
     if kind == Sensing.KIND:
         return Sensing(sequence, time, **_arrays(body))
-    desired = np.frombuffer(body, "<f4", offset=_ANSWER.size).astype(np.float32)
+    numbers = np.frombuffer(body, "<f4", offset=_ANSWER.size).astype(np.float32)
     answers, answers_time, mode = _ANSWER.unpack_from(body)
-    return Targets(sequence, time, answers, answers_time, mode, desired)
+    return Targets(sequence, time, answers, answers_time, mode, numbers[:12], numbers[12:].reshape(4, 2))
 
 
 def _frame(kind: int, sequence: int, time: int, body: bytes) -> bytes:

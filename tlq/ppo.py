@@ -63,6 +63,8 @@ class PPOConfig:
     """The gradient is scaled down to this norm."""
     reward_scaling: float = 0.1
     """Factor on the reward."""
+    guide: float = 0.0
+    """Weight with which the policy imitates the scripted guide to footholds (envs/guide.py); 0: it learns alone."""
 
 
 @flax.struct.dataclass
@@ -89,6 +91,7 @@ class Rollout:
     reward: jax.Array  # (T, B)
     done: jax.Array  # (T, B)
     truncation: jax.Array  # (T, B)
+    guide: jax.Array  # (T, B, A) change of the action that a guide asks for; (T, B, 0) without one
 
 
 def make_mesh(num_devices: int = 0) -> Mesh:
@@ -275,6 +278,7 @@ class Learner:
                 reward=after.reward,
                 done=after.done,
                 truncation=after.info["truncation"],
+                guide=env_state.info.get("guide", jnp.zeros((*after.done.shape, 0))),
             )
             metrics = {k: jnp.mean(v) for k, v in after.metrics.items()}
             return after, (rollout, dict(metrics, reward=jnp.mean(after.reward)))
@@ -356,7 +360,10 @@ def summarise(means: dict[str, jax.Array], steps: int) -> dict[str, jax.Array]:
 
 def _loss_metrics(losses: dict[str, jax.Array], minibatches: int) -> dict[str, jax.Array]:
     """Means over the gradient steps (each (epochs x minibatches,)); `kl_last` over the last pass."""
-    figures = {f"loss/{n}": jnp.mean(losses[n]) for n in ("policy", "value", "entropy", "total", "grad_norm")}
+    figures = {
+        f"loss/{n}": jnp.mean(losses[n])
+        for n in ("policy", "value", "entropy", "guide", "total", "grad_norm")
+    }
     figures |= {n: jnp.mean(losses[n]) for n in ("std", "std_max")}
     finite = jnp.isfinite(losses["total"]) & jnp.isfinite(losses["grad_norm"])
     kl = losses["kl"]

@@ -103,7 +103,7 @@ class Controller:
 
     def sample_points(self, sensors: Sensors) -> np.ndarray:
         """Points (L, P, 2) m at which `step` wants the terrain's height: heading frame, from the trunk's centre."""
-        return self.core.sample_points(self.core.feet(_sensors(sensors)))
+        return self.core.sample_points(self.state, _sensors(sensors))
 
     def step(self, sensors: Sensors, heights: np.ndarray | None, command: np.ndarray) -> np.ndarray:
         """One control period.
@@ -242,7 +242,7 @@ def _core(metadata: dict[str, Any]) -> tg.Core:
         geometry = {
             name: numbers(metadata["leg"][name], f"leg.{name}", *shape) for name, shape in shapes.items()
         }
-        settings = tg.TGConfig(**metadata["tg"])
+        settings = tg.TGConfig(**(tg.BEFORE | metadata["tg"]))
         core = tg.Core(
             settings,
             tg.LegGeometry(**geometry),

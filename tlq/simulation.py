@@ -125,18 +125,23 @@ class Simulation:
         mujoco.mj_step(self.model, data)
         return float(np.abs(torque) @ np.abs(speed)) * self.model.opt.timestep
 
-    def look(self) -> None:
-        """Reads sensors, and the terrain at the feet: as it is, and as it is perceived."""
+    def look(self, centres: np.ndarray | None = None) -> None:
+        """Reads sensors, and the terrain at the feet: as it is, and as it is perceived.
+
+        centres: (4, 2) m, heading frame, where the heights are wanted, NaN for the foot; None: where the controller
+          wants them.
+        """
         data, core, exact = self.data, self.controller.core, self.exact_sensors()
         self._feet = core.feet(exact)
-        points = core.sample_points(self._feet)
-        self._ground = self._height(points)
-        self.sensors, self.heights = exact._asdict(), self._ground - data.qpos[2]
+        self._ground = self._height(core.around(self._feet))
+        self.sensors, offset, error = exact._asdict(), np.zeros(3), np.zeros(())
         if self.noise is not None:
-            self.sensors = noisy(self.sensors, self.noise, self._random)
-            points = self.controller.sample_points(self.sensors) + self._offset[:2]
-            error = self.noise.height_noise * self._random.standard_normal(points.shape[:-1])
-            self.heights = self._height(points) - data.qpos[2] + self._offset[2] + error
+            self.sensors, offset = noisy(self.sensors, self.noise, self._random), self._offset
+            error = self.noise.height_noise * self._random.standard_normal(self._ground.shape)
+        self.points = self.controller.sample_points(self.sensors)
+        if centres is not None:
+            self.points = core.around(np.where(np.isfinite(centres), centres, self._feet[:, :2]))
+        self.heights = self._height(self.points + offset[:2]) - data.qpos[2] + offset[2] + error
 
     def _height(self, points: np.ndarray) -> np.ndarray:
         """Terrain height (...) m in the world at points (..., 2) m of the heading frame."""

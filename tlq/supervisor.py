@@ -15,6 +15,7 @@ import math
 
 import numpy as np
 
+import tg
 from tlq.messages import Sensing
 from tlq.runtime import Controller
 
@@ -106,6 +107,16 @@ class Supervisor:
         change = np.clip(wanted - self._desired, -self.config.max_change, self.config.max_change)
         self._desired = self._desired + change
         return self._desired.copy()
+
+    def centres(self) -> np.ndarray:
+        """Round which places (4, 2) m the next message's heights are wanted, as in `Targets`."""
+        core, state = self.controller.core, self.controller.state
+        if self.last is None or not core.config.look_ahead:
+            return np.full((4, 2), np.nan)
+        sensors = tg.Sensors(**self.last.sensors)
+        swing = (tg.path.leg_phases(state.phase) > 0)[:, None]
+        # By then the trunk will have come nearer.
+        return np.where(swing, core.centres(state, sensors) - core.dt * state.velocity, np.nan)
 
     def fault(self, message: Sensing | None, now: float) -> str:
         """What is wrong with a message, in one word; empty if it can be acted on."""

@@ -44,6 +44,8 @@ def make_learner(config: TrainConfig, env: Env | None = None, heights: int | Non
         import envs
 
         env = envs.AutoReset(envs.make(config.env))
+        if config.ppo.guide:
+            env = envs.Guided(env)
     if heights is None:
         heights = 0 if config.env.method == "blind" else 100
     networks = make_networks(env.observation_size, env.action_size, config=config.policy, heights=heights)

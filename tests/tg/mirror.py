@@ -38,4 +38,5 @@ def mirror_state(state):
         targets=targets,
         desired=mirror_joints(state.desired),
         turn=-state.turn,
+        velocity=state.velocity * [1, -1],
     )

@@ -203,14 +203,72 @@ def test_feet_are_mujocos(subject):
     np.testing.assert_allclose(subject.core.feet(sensors), expected, atol=1e-7)
 
 
-def test_sample_points_lie_round_the_feet(subject):
+def test_points_lie_on_circles(subject):
     core = subject.core
     feet = core.feet(random_sensors(core, 3))
-    points = core.sample_points(feet)
+    points = core.around(feet)
     assert points.shape == (4, 25, 2)
     distance = np.linalg.norm(points - feet[:, None, :2], axis=-1)
     radii = np.repeat([0.0, 0.03, 0.06, 0.10], [1, 6, 8, 10])
     np.testing.assert_allclose(np.sort(distance, axis=1), np.tile(radii, (4, 1)), atol=1e-7)
+
+
+def test_heights_are_wanted_where_feet_in_swing_land(subject):
+    """Of feet in stance, of a robot that stands, and without look-ahead: round the feet."""
+    core, sensors = subject.core, random_sensors(subject.core, 3)
+    feet, state = core.feet(sensors)[:, :2], walk(core, 20)[-1][0]
+    swing = tg.path.leg_phases(state.phase) > 0
+    assert swing.sum() == 2 and state.gate == 1
+    landing = core.landing_points(state, sensors, core.odometry(state, sensors))
+    expected = np.where(swing[:, None], landing, feet)
+    assert np.abs(landing - feet)[swing].max() > 0.02
+    np.testing.assert_allclose(core.sample_points(state, sensors), core.around(expected))
+    np.testing.assert_allclose(core.centres(state._replace(gate=0.0 * state.gate), sensors), feet)
+    behind = dataclasses.replace(core, config=dataclasses.replace(core.config, look_ahead=False))
+    np.testing.assert_allclose(behind.sample_points(state, sensors), core.around(feet))
+
+
+def test_feet_land_where_the_generator_leads_them(subject):
+    """Joints that follow at once, a trunk that doesn't move: at the end of the step, but for what comes down early."""
+    core = subject.core
+    level = random_sensors(core, 3)._replace(orientation=np.array([1.0, 0, 0, 0]))
+    state = walk(core, 20)[-1][0]
+    reached = state.targets[0].reshape(4, 3)
+    sensors = level._replace(joint_position=tg.leg.inverse(core.geometry, reached).reshape(-1))
+    found = core.landing_points(state, sensors, np.zeros(2))
+    ends = core.foot_targets(np.full(4, np.pi), 0.0 * state.lift, state.stride, sensors)
+    moved = core.residual_displacement(state, sensors)
+    early = tg.core.EARLY * core.config.step_length * state.stride
+    expected = (core.geometry.hip_position + ends + moved)[:, :2] - early
+    np.testing.assert_allclose(found, expected, atol=1e-6)
+    ahead = core.landing_points(state, sensors, np.array([0.5, 0.0])) - found
+    left = np.maximum(np.pi - tg.path.leg_phases(state.phase), 0) / (2 * np.pi * state.frequency)
+    np.testing.assert_allclose(ahead, 0.5 * left[:, None] * [1, 0], atol=1e-6)
+
+
+def test_odometry_is_the_trunks_velocity(subject):
+    """A trunk that moves and turns over feet that stand still, by MuJoCo's kinematics; smoothed, it gets there."""
+    core, random = subject.core, np.random.default_rng(4)
+    sensors, state = random_sensors(core, 3), walk(core, 20)[-1][0]._replace(gate=np.float64(0.0))
+    ids, data = subject.robot.foot_site_ids, subject.place(sensors.joint_position, sensors.orientation)
+    model = subject.model
+    velocity, turning = 0.3 * random.normal(size=3), 0.3 * random.normal(size=3)
+    speeds = []
+    for foot in ids:
+        jacobian = np.zeros((3, model.nv))
+        mujoco.mj_jacSite(model, data, jacobian, None, foot)
+        speeds.append(jacobian)
+    # Joint speeds (3 a leg) such that no foot moves.
+    joint_velocity = np.zeros(12)
+    for leg, jacobian in enumerate(speeds):
+        own = subject.robot.dof_ids[3 * leg : 3 * leg + 3]
+        given = jacobian[:, :3] @ velocity + jacobian[:, 3:6] @ turning
+        joint_velocity[3 * leg : 3 * leg + 3] = np.linalg.solve(jacobian[:, own], -given)
+    sensors = sensors._replace(joint_velocity=joint_velocity, angular_velocity=turning)
+    for _ in range(40):
+        state = state._replace(velocity=core.odometry(state, sensors))
+    expected = tg.frames.turn(-tg.frames.yaw(sensors.orientation), velocity[:2])
+    np.testing.assert_allclose(state.velocity, expected, atol=0.02)
 
 
 def test_observation_by_parts(subject):

@@ -23,7 +23,9 @@ def numbers(*shape):
 SENSING = st.builds(
     Sensing, sequence=COUNT, time=COUNT, **{name: numbers(*shape) for name, shape in Sensing.FIELDS.items()}
 )
-TARGETS = st.builds(Targets, COUNT, COUNT, COUNT, COUNT, st.integers(0, 2**32 - 1), numbers(12))
+TARGETS = st.builds(
+    Targets, COUNT, COUNT, COUNT, COUNT, st.integers(0, 2**32 - 1), numbers(12), numbers(4, 2)
+)
 
 
 def sensing(**changes):
@@ -39,6 +41,7 @@ def targets(**changes):
         "answers_time": 4,
         "mode": 2,
         "desired": np.arange(12.0),
+        "centres": np.arange(8.0).reshape(4, 2),
     }
     return Targets(**values | changes)
 
@@ -67,7 +70,7 @@ def test_the_bytes_are_those_of_the_document():
     """Read by hand, at the offsets that docs/deployment.md gives."""
     data = sensing(command=np.array([0.6, -0.8])).pack()
     assert len(data) == 560 < LARGEST
-    assert data[:8] == b"TLQM" + bytes([1, 1]) + struct.pack("<H", 532)
+    assert data[:8] == b"TLQM" + bytes([2, 1]) + struct.pack("<H", 532)
     assert struct.unpack_from("<QQ", data, 8) == (7, 123456789)
     assert struct.unpack_from("<4f", data, 24) == pytest.approx(np.linspace(-1, 1, 4), abs=1e-6)
     assert struct.unpack_from("<12f", data, 52) == pytest.approx(np.linspace(-1, 1, 12), abs=1e-6)
@@ -75,10 +78,11 @@ def test_the_bytes_are_those_of_the_document():
     assert struct.unpack_from("<100f", data, 156) == pytest.approx(np.linspace(-1, 1, 100), abs=1e-6)
     assert struct.unpack_from("<I", data, 556)[0] == zlib.crc32(data[:556])
     data = targets().pack()
-    assert len(data) == 96 and data[:8] == b"TLQM" + bytes([1, 2]) + struct.pack("<H", 68)
+    assert len(data) == 128 and data[:8] == b"TLQM" + bytes([2, 2]) + struct.pack("<H", 100)
     assert struct.unpack_from("<QQQQI", data, 8) == (1, 2, 3, 4, 2)
     assert struct.unpack_from("<12f", data, 44) == tuple(range(12))
-    assert struct.unpack_from("<I", data, 92)[0] == zlib.crc32(data[:92])
+    assert struct.unpack_from("<8f", data, 92) == tuple(range(8))
+    assert struct.unpack_from("<I", data, 124)[0] == zlib.crc32(data[:124])
 
 
 @pytest.mark.parametrize("message", [sensing(), targets()], ids=["sensing", "targets"])
@@ -109,7 +113,7 @@ def test_foreign_bytes_are_refused(data):
 @given(st.binary(max_size=600), st.integers(0, 255), st.integers(0, 255), st.integers(0, 65535))
 def test_foreign_bytes_under_our_name_and_a_right_checksum_are_refused(body, version, kind, size):
     data = b"TLQM" + struct.pack("<BBHQQ", version, kind, size, 0, 0) + body
-    if (version, kind, size, len(body)) in ((1, 1, 532, 532), (1, 2, 68, 68)):
+    if (version, kind, size, len(body)) in ((2, 1, 532, 532), (2, 2, 100, 100)):
         return
     with pytest.raises(MessageError):
         unpack(data + struct.pack("<I", zlib.crc32(data)))
@@ -118,7 +122,7 @@ def test_foreign_bytes_under_our_name_and_a_right_checksum_are_refused(body, ver
 def test_other_versions_are_named():
     data = bytearray(sensing().pack())
     data[4] = 9
-    with pytest.raises(MessageError, match="message version 9; this program reads version 1"):
+    with pytest.raises(MessageError, match="message version 9; this program reads version 2"):
         unpack(bytes(data))
 
 

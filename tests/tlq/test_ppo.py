@@ -163,6 +163,35 @@ def test_a_task_that_needs_the_memory(memory, solves):
     assert (reward > 0.6) == solves, reward
 
 
+class Asking(Wrapper):
+    """Asks for more of the first action, whatever the state."""
+
+    def _ask(self, state):
+        return state.replace(info=state.info | {"guide": jnp.zeros(ACTIONS).at[0].set(0.2)})
+
+    def reset(self, key):
+        return self._ask(self.env.reset(key))
+
+    def step(self, state, action):
+        return self._ask(self.env.step(state, action))
+
+
+def test_a_policy_does_what_its_guide_asks_for():
+    config = dataclasses.replace(CONFIG, guide=30.0, learning_rate=1e-3, epochs=4)
+    learner = make_learner(config=config, env=Asking(ToyEnv(length=5)))
+    state = learner.init(0)
+    means = []
+    for _ in range(8):
+        state, metrics = learner.step(state)
+        parameters = learner.networks.policy_network.apply(
+            state.normaliser, state.params.policy, state.env_state.obs
+        )
+        means.append(float(jnp.mean(jnp.tanh(parameters["action"][:, 0]))))
+    assert means[-1] > means[0] + 0.1
+    # What it asks for is a change of the old mean: an unchanged policy is off by just that.
+    assert 0 < float(metrics["loss/guide"]) < 0.05
+
+
 def test_constants_become_arguments():
     table = jnp.arange(1000.0)
     constants, pure = hoist(lambda x: {"y": table[x["i"]] + 1}, {"i": jax.ShapeDtypeStruct((), jnp.int32)})
