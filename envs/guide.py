@@ -18,11 +18,11 @@ from envs.types import Episode
 
 CELL = 0.02
 """Spacing (m) of the points whose heights are compared."""
-REACH = 4
+REACH = 5
 """A foot can be sent this many cells to each side of where it will come down."""
 GAIN = 0.3
 """Share of the way that one step asks for."""
-LIMIT = 0.09
+LIMIT = 0.12
 """Displacement (m) of a foot from the trajectory generator's path, forwards or sideways, beyond which it isn't sent."""
 LIFTING = 0.3
 """Phase (rad) of swing up to which a foot isn't sent anywhere."""

@@ -74,7 +74,8 @@ class ControllerState(NamedTuple):
     """(2,) m/s, the trunk's by the motion of the stance legs, heading frame."""
 
 
-def _layout(heights: bool) -> tuple[tuple[str, int], ...]:
+def layout(heights: bool) -> tuple[tuple[str, int], ...]:
+    """Names and sizes of the parts of the observation, in order."""
     parts = [
         ("command", 2),
         ("up", 3),
@@ -114,7 +115,7 @@ class Core:
     @functools.cached_property
     def layout(self) -> tuple[tuple[str, int], ...]:
         """Names and sizes of the parts of the observation, in order."""
-        return _layout(self.heights)
+        return layout(self.heights)
 
     @property
     def observation_size(self) -> int:

@@ -5,6 +5,7 @@ run/config.yaml  metrics.csv  events.*  curve.png  policy.npz  checkpoints/  fai
 
 import contextlib
 import dataclasses
+import json
 import signal
 import time
 from collections.abc import Iterator
@@ -17,9 +18,10 @@ import numpy as np
 from brax.envs.base import Env
 from brax.envs.wrappers.training import VmapWrapper
 
+import tg
 from tlq import memory
 from tlq.checkpoint import Checkpoints, names, read_arrays
-from tlq.config import TrainConfig, save_config
+from tlq.config import TrainConfig, load_config, save_config
 from tlq.export import commit
 from tlq.logger import Logger
 from tlq.networks import make_networks
@@ -63,7 +65,7 @@ def train(config: TrainConfig, env: Env | None = None, heights: int | None = Non
     state = learner.init(config.seed)
     goes_on = config.resume and has_checkpoint(folder)
     if config.init and not goes_on:
-        state = initialise(state, config.init)
+        state = initialise(state, config.init, config)
         if not int(state.normaliser.count.lo):
             state = measure_rest(learner, state)
     folder.mkdir(parents=True, exist_ok=True)
@@ -175,14 +177,27 @@ def save_failed(config: TrainConfig, before: TrainState, iteration: int) -> str:
     return f"update {iteration} (seed {config.seed}) isn't finite; the state before it is in {place}{why}"
 
 
-def initialise(state: TrainState, source: str) -> TrainState:
-    """Parameters and normaliser from another run's folder or from a policy file (which has nothing for the critic)."""
-    path = Path(source)
+def initialise(state: TrainState, source: str, config: TrainConfig | None = None) -> TrainState:
+    """Parameters and normaliser from another run's folder or from a policy file (which has nothing for the critic).
+
+    config: of the run that starts; a policy that learnt with another range of residual angles is converted.
+    """
+    path, before = Path(source), None
     if path.is_dir():
         arrays = read_arrays(path / "checkpoints" if (path / "checkpoints").is_dir() else path)
+        if (path / "config.yaml").is_file():
+            before = load_config(path / "config.yaml").env
     else:
         with np.load(path) as file:
             arrays = {k: file[k] for k in file.files}
+        if "metadata" in arrays:
+            from tlq.evaluate import training_env
+
+            before = training_env(json.loads(str(arrays["metadata"])))
+    if config is not None and config.env is not None and before is not None:
+        ratio = before.tg.residual_range / config.env.tg.residual_range
+        if ratio != 1.0:
+            arrays = rescale_residuals(arrays, ratio)
     parts = {"params": state.params, "normaliser": state.normaliser}
     taken = []
 
@@ -204,6 +219,39 @@ def initialise(state: TrainState, source: str) -> TrainState:
     parts = jax.tree.unflatten(jax.tree.structure(parts), flat)
     print(f"init: {len(taken)} of {len(flat)} arrays from {source}", flush=True)
     return dataclasses.replace(state, params=parts["params"], normaliser=parts["normaliser"])
+
+
+def rescale_residuals(arrays: dict[str, np.ndarray], ratio: float) -> dict[str, np.ndarray]:
+    """A policy's parameters and normaliser with residual actions `ratio` times as large as they were.
+
+    So it asks for the same angles where the range of residuals is 1/ratio times as wide: exactly where actions are
+    small, somewhat more where they were near their limits.
+    """
+    arrays, residual = dict(arrays), slice(2, tg.ACTION_SIZE)
+    spread = slice(tg.ACTION_SIZE + 2, 2 * tg.ACTION_SIZE)
+    start = 0
+    for name, size in tg.core.layout(heights=False):
+        if name == "actions":
+            break
+        start += size
+    seen = start + np.arange(2 * tg.ACTION_SIZE).reshape(2, -1)[:, residual].reshape(-1)
+    for name, x in arrays.items():
+        x = np.array(x)
+        if name.endswith("params.action.kernel"):
+            x[:, residual] *= ratio
+        elif name.endswith("params.action.bias"):
+            x[residual] *= ratio
+            x[spread] = np.log(np.expm1(ratio * np.logaddexp(x[spread], 0.0)))
+        elif ".leg_action." in name:
+            x *= ratio
+        elif name.startswith(("normaliser.mean.", "normaliser.std.")):
+            x[seen] *= ratio
+        elif name.startswith("normaliser.summed_variance."):
+            x[seen] *= ratio**2
+        else:
+            continue
+        arrays[name] = x
+    return arrays
 
 
 def measure_rest(learner: Learner, state: TrainState) -> TrainState:

@@ -42,7 +42,7 @@ def test_feet_are_sent_to_the_best_ground_near(exact, command):
                 at = np.asarray(xy) + tg.frames.turn(np.array(0.4), landing + way)
                 return float(terrains.exact_height(terrain, cell_centres(env.bank, at)))
 
-            cells = [guide.CELL * np.array([i, j]) for i in range(-5, 6) for j in range(-5, 6)]
+            cells = [guide.CELL * np.array([i, j]) for i in range(-6, 7) for j in range(-6, 7)]
             heights = [height(way) for way in cells]
             low = {
                 (round(w[0], 3), round(w[1], 3)): max(heights) - h > threshold

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -19,9 +20,16 @@ from tlq import training
 from tlq.checkpoint import names, read_arrays
 from tlq.config import TrainConfig, load_config
 from tlq.logger import Logger, read_csv, text_line
-from tlq.networks import NetworkConfig
+from tlq.networks import NetworkConfig, make_networks
 from tlq.ppo import PPOConfig
-from tlq.training import TrainingFailed, initialise, make_learner, measure_rest, train
+from tlq.training import (
+    TrainingFailed,
+    initialise,
+    make_learner,
+    measure_rest,
+    rescale_residuals,
+    train,
+)
 
 ROOT = Path(__file__).parents[2]
 NETWORKS = NetworkConfig(
@@ -198,6 +206,41 @@ def test_parameters_of_other_sizes_are_refused(learner, tmp_path):
     np.savez(tmp_path / "policy.npz", x=np.zeros(3))
     with pytest.raises(ValueError, match="doesn't fit: params.policy.params.action.bias is missing"):
         initialise(learner.init(0), str(tmp_path / "policy.npz"))
+
+
+def test_a_policy_is_converted_to_another_range_of_residuals(tmp_path):
+    """The same small angles from the same observations, in which its own last actions are smaller, too."""
+    networks = make_networks({"state": (188,), "privileged_state": (232,)}, 14, config=NetworkConfig())
+    policy = networks.policy_network.init(jax.random.PRNGKey(0))
+    random = np.random.default_rng(0)
+    mean, std = random.normal(size=188), random.uniform(0.5, 2.0, 188)
+    leaves = zip(names({"params": {"policy": policy}}), jax.tree.leaves(policy), strict=True)
+    arrays = {name: np.asarray(x) for name, x in leaves}
+    arrays |= {"normaliser.mean.state": mean, "normaliser.std.state": std}
+    converted = rescale_residuals(arrays, 0.6)
+    changed = jax.tree.unflatten(
+        jax.tree.structure(policy), [converted[n] for n in arrays if n.startswith("params")]
+    )
+
+    def parameters(policy, arrays, state):
+        state = jnp.asarray(state, jnp.float32)[None]
+        seen = SimpleNamespace(
+            mean={"state": jnp.asarray(arrays["normaliser.mean.state"], jnp.float32)},
+            std={"state": jnp.asarray(arrays["normaliser.std.state"], jnp.float32)},
+        )
+        obs = {"state": state, "carry": jnp.zeros((1, 128)), "is_first": jnp.zeros((1, 1))}
+        return np.asarray(networks.policy_network.apply(seen, policy, obs)["action"][0])
+
+    state = random.normal(size=188)
+    smaller = state.copy()
+    for first in (35, 49):
+        smaller[first + 2 : first + 14] *= 0.6
+    before, after = parameters(policy, arrays, state), parameters(changed, converted, smaller)
+    np.testing.assert_allclose(after[:2], before[:2], atol=1e-5)
+    np.testing.assert_allclose(after[2:14], 0.6 * before[2:14], atol=1e-5)
+    spread = np.logaddexp(before[14:], 0)
+    np.testing.assert_allclose(np.logaddexp(after[14:16], 0), spread[:2], rtol=1e-4)
+    np.testing.assert_allclose(np.logaddexp(after[16:], 0), 0.6 * spread[2:], rtol=0.02)
 
 
 def test_the_line_of_text():
