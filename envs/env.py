@@ -74,6 +74,11 @@ class QuadrupedEnv(Env):
         """V: the observation, 100 true heights where the policy is blind, and 44 more (see `_privileged`)."""
         return self.core.observation_size + (0 if self.core.heights else 100) + 44
 
+    @property
+    def has_pits(self) -> bool:
+        """Whether some of its terrain has gaps that a foot must not step into."""
+        return bool(np.any(np.asarray(self.bank.floor) < -self.config.rewards.gap_threshold))
+
     def reset(self, key: jax.Array) -> State:
         """A robot standing on the start platform of a random terrain, with a random command.
 

@@ -19,9 +19,9 @@ class RewardConfig:
     """Weight of r_smooth."""
     energy: float = 0.0005
     """Weight of r_tau (1/W)."""
-    terrain: float = 2.5
+    terrain: float = 3.0
     """Weight of r_terrain (mean over the feet)."""
-    aim: float = 2.5
+    aim: float = 3.0
     """Weight of r_terrain for the feet in swing, where they will come down (mean over the feet). Not in the paper: a
     foot in stance can't be moved any more, this pays for moving it while it can."""
     height: float = 1.0

@@ -63,8 +63,9 @@ class PPOConfig:
     """The gradient is scaled down to this norm."""
     reward_scaling: float = 0.1
     """Factor on the reward."""
-    guide: float = 0.0
-    """Weight with which the policy imitates the scripted guide to footholds (envs/guide.py); 0: it learns alone."""
+    guide: float = 4.0
+    """Weight with which the policy imitates the scripted guide to footholds (envs/guide.py) where the terrain has pits;
+    0: it learns alone."""
 
 
 @flax.struct.dataclass

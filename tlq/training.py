@@ -45,8 +45,9 @@ def make_learner(config: TrainConfig, env: Env | None = None, heights: int | Non
     if env is None:
         import envs
 
-        env = envs.AutoReset(envs.make(config.env))
-        if config.ppo.guide:
+        made = envs.make(config.env)
+        env = envs.AutoReset(made)
+        if config.ppo.guide and made.has_pits:
             env = envs.Guided(env)
     if heights is None:
         heights = 0 if config.env.method == "blind" else 100

@@ -92,6 +92,12 @@ def test_the_action_moves_the_feet_that_way(exact, command):
     assert asked > 2
 
 
+def test_only_terrain_with_gaps_has_pits(exact):
+    assert exact.env.has_pits
+    flat = terrains.TerrainConfig(kind="flat", num_terrains=12, half_extent=2.0)
+    assert not envs.make(envs.EnvConfig(terrain=flat)).has_pits
+
+
 def test_a_guided_environment_adds_what_the_guide_asks_for(exact):
     env = envs.Guided(exact.auto)
     state = jax.jit(env.reset)(jax.random.key(0))

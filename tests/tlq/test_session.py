@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import rewards
+import tg
 from tests.tlq.policies import trained
 from tlq import insight, session
 from tlq.render import RenderError
@@ -224,7 +225,11 @@ def test_points_and_paths_are_at_the_feet(flat):
         insight.foot_paths(flat.sim),
     )
     assert points.shape == (4, 25, 3) and paths.shape == (4, 24, 3)
-    np.testing.assert_allclose(points[:, 0, :2], feet[:, :2], atol=1e-6)
+    stance = tg.path.leg_phases(flat.sim.controller.state.phase) <= 0
+    np.testing.assert_allclose(points[stance, 0, :2], feet[stance, :2], atol=1e-6)
+    # Feet in swing will land in front of where they are, along the command.
+    ahead = (points[~stance, 0, :2] - feet[~stance, :2])[:, 0]
+    assert stance.sum() == 2 and (ahead > 0).all() and (ahead < 0.4).all()
     np.testing.assert_allclose(points[..., 2], 0.0, atol=1e-6)
     np.testing.assert_allclose(paths[:, 0], paths[:, -1], atol=1e-6)  # closed
     # As wide as the stride, along the command; as high as the foot is lifted.
