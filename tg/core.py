@@ -176,7 +176,7 @@ class Core:
         """The points (4, 25, 2) m of the circles round places (4, 2 or 3) m."""
         return centres[:, None, :2] + self._ring_offsets
 
-    def odometry(self, state: ControllerState, sensors: Sensors) -> Array:
+    def odometry(self, state: ControllerState, sensors: Sensors, level: Array | None = None) -> Array:
         """The trunk's velocity (2,) m/s in the heading frame, by the legs in stance, smoothed over a few steps.
 
         A foot that carries weight is taken to stand still: the trunk moves against it by what joints and gyro say.
@@ -184,13 +184,14 @@ class Core:
         xp = sensors.joint_position.__array_namespace__()
         q, speed = (xp.reshape(x, (4, 3)) for x in (sensors.joint_position, sensors.joint_velocity))
         moment = 0.01  # s; long enough for single precision
-        now, then = leg.forward(self.geometry, xp.stack([q, q + moment * speed]))
+        now, then = leg.forward(self.geometry, q), leg.forward(self.geometry, q + moment * speed)
         share = load_share(path.leg_phases(state.phase), state.gate)
         x, y, z = share @ (self.geometry.hip_position + now)
         a, b, c = sensors.angular_velocity
         turned = stack([b * z - c * y, c * x - a * z, a * y - b * x])
         velocity = -(share @ (then - now) / moment + turned)
-        level = frames.heading_from_trunk(frames.up_in_trunk(sensors.orientation))
+        if level is None:
+            level = frames.heading_from_trunk(frames.up_in_trunk(sensors.orientation))
         return state.velocity + SMOOTHING * ((level @ velocity)[:2] - state.velocity)
 
     def residual_displacement(self, state: ControllerState, sensors: Sensors) -> Array:
@@ -284,17 +285,19 @@ class Core:
         phases = path.leg_phases(phase)
         lift = xp.where(phases > 0, state.lift, self._lift(action[1]))
 
-        targets = self.foot_targets(phases, lift * gate, stride, sensors)
+        up = frames.up_in_trunk(sensors.orientation)
+        level = frames.heading_from_trunk(up)
+        targets = self.foot_targets(phases, lift * gate, stride, sensors, level)
         tg_angles = leg.inverse(self.geometry, targets)
         residual = c.residual_range * xp.reshape(action[2:], (4, 3))
         wanted = tg_angles + residual
         reached = leg.forward(self.geometry, wanted)
         sag = leg.support_torque(
-            self.geometry, wanted, c.weight_compensation * self.sag * load_share(phases, gate)
+            self.geometry, wanted, c.weight_compensation * self.sag * load_share(phases, gate), reached
         )
         desired = xp.clip(xp.reshape(wanted + sag, (12,)), self.lower, self.upper)
-        velocity = self.odometry(state, sensors) if c.look_ahead else state.velocity
-        rate = frames.yaw_rate(frames.up_in_trunk(sensors.orientation), sensors.angular_velocity)
+        velocity = self.odometry(state, sensors, level) if c.look_ahead else state.velocity
+        rate = frames.yaw_rate(up, sensors.angular_velocity)
         state = ControllerState(
             phase=phase,
             frequency=frequency,
@@ -310,7 +313,9 @@ class Core:
         )
         return state, desired
 
-    def foot_targets(self, phases: Array, lift: Array, stride: Array, sensors: Sensors) -> Array:
+    def foot_targets(
+        self, phases: Array, lift: Array, stride: Array, sensors: Sensors, level: Array | None = None
+    ) -> Array:
         """pos^d = [dx + X, dy + Y, dz + Z] of the paper, turned from the horizontal frame into the trunk's.
 
         Args:
@@ -318,6 +323,7 @@ class Core:
           lift: (4,) m.
           stride: (2,) direction in the heading frame; the step is L times as long.
           sensors: whose roll and pitch are taken out.
+          level: (3, 3) `heading_from_trunk` of those, where it is known already.
 
         Returns:
           (4, 3) m from the abduction joints, trunk frame.
@@ -325,9 +331,10 @@ class Core:
         xp = phases.__array_namespace__()
         along = path.stride(phases)[:, None] * (self.config.step_length * stride)
         motion = xp.concatenate([along, (lift * path.height(phases))[:, None]], axis=-1)
-        horizontal = frames.heading_from_trunk(frames.up_in_trunk(sensors.orientation))
+        if level is None:
+            level = frames.heading_from_trunk(frames.up_in_trunk(sensors.orientation))
         share = self.config.levelling
-        return (share * self.base_foot + motion) @ horizontal + (1.0 - share) * self.base_foot
+        return (share * self.base_foot + motion) @ level + (1.0 - share) * self.base_foot
 
     def update_mirror(self, mirror: Array, command: Array) -> Array:
         """+1 for commands to the left, -1 to the right, with hysteresis around straight ahead."""

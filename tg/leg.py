@@ -67,19 +67,20 @@ def inverse(leg: LegGeometry, foot: Array) -> Array:
     return stack([abduction, hip, knee]) * leg.sign
 
 
-def support_torque(leg: LegGeometry, q: Array, load: Array) -> Array:
+def support_torque(leg: LegGeometry, q: Array, load: Array, foot: Array | None = None) -> Array:
     """Joint torques with which massless legs carry loads: τ = -Jᵀ F, F the ground's upward force on the foot.
 
     Args:
       leg: geometry.
       q: (..., 4, 3) rad.
       load: (..., 4) N, along the trunk's z.
+      foot: (..., 4, 3) m, `forward` of q, where it is known already.
 
     Returns:
       (..., 4, 3) N·m.
     """
     xp = q.__array_namespace__()
-    foot = forward(leg, q)
+    foot = forward(leg, q) if foot is None else foot
     canonical = q * leg.sign
     # ∂z/∂abduction = y, ∂z/∂hip = x cos(abduction), ∂z/∂knee = shank sin(hip + knee) cos(abduction).
     cos = xp.cos(canonical[..., 0])
