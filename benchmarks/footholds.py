@@ -32,9 +32,16 @@ from benchmarks import timing  # noqa: E402
 from envs import guide  # noqa: E402
 from tlq import cli  # noqa: E402
 from tlq import config as settings  # noqa: E402
-from tlq.evaluate import FIRST_SEED, training_env  # noqa: E402
+from tlq.config import training_env  # noqa: E402
+from tlq.evaluate import FIRST_SEED  # noqa: E402
 from tlq.runtime import Policy, load_policy  # noqa: E402
 
+AHEAD = (1, 4, 8)
+"""Control steps before a foot lands at which the point where it was said to land is judged."""
+SETTLED = 3
+"""Control steps after which a foot stands."""
+AT_LIMIT = 0.9
+"""Residual action from which it counts as being at its limit, 1."""
 DROP = 0.6
 """Phase (rad) up to which a foot that lifts off forgets where it was led, by a tenth each step."""
 
@@ -83,15 +90,11 @@ def with_reflex(
     env: envs.QuadrupedEnv, episode: envs.Episode, action: jax.Array, led: jax.Array
 ) -> jax.Array:
     """The policy's action (14,) with residual joint angles that move the feet by `led` (L, 2) m."""
-    core, sensors = env.core, envs.env.exact_sensors(episode)
-    controller, up = episode.controller, tg.frames.up_in_trunk(sensors.orientation)
+    controller, sensors = episode.controller, envs.env.exact_sensors(episode)
     phases = tg.path.leg_phases(controller.phase)
-    target = core.foot_targets(phases, controller.lift * controller.gate, controller.stride, sensors)
-    shift = jnp.pad(led, ((0, 0), (0, 1))) @ tg.frames.heading_from_trunk(up)
-    angles = tg.leg.inverse(core.geometry, target + shift) - tg.leg.inverse(core.geometry, target)
-    mirror = core.update_mirror(controller.mirror, env.heading_command(episode))
-    added = jnp.concatenate([jnp.zeros(2), (angles / core.config.residual_range).reshape(-1)])
-    return jnp.clip(action + core.mirror_action(mirror, added), -1.0, 1.0)
+    lift = controller.lift * controller.gate
+    target = env.core.foot_targets(phases, lift, controller.stride, sensors)
+    return jnp.clip(action + guide.change(env, episode, target, led), -1.0, 1.0)
 
 
 def step(
@@ -99,27 +102,63 @@ def step(
 ) -> tuple[tuple[Any, jax.Array, jax.Array], dict[str, jax.Array]]:
     """One control step of one robot, and what it shows."""
     state, memory, led = carried
+    episode = state.pipeline_state
     action, memory = policy.graph(state.obs["state"], memory)
     if options.reflex:
-        led = lead(env, state.pipeline_state, led, options.gain)
-        action = with_reflex(env, state.pipeline_state, action, led)
+        led = lead(env, episode, led, options.gain)
+        action = with_reflex(env, episode, action, led)
     state = env.step(state, action)
-    episode = state.pipeline_state
+    before, episode = episode, state.pipeline_state
     _, around = env._terrain_at_feet(episode)
     over = jnp.max(around, axis=1) - around[:, 0] > env.config.rewards.gap_threshold
     stance = tg.path.leg_phases(episode.controller.phase) <= 0
+    mirror = env.core.update_mirror(before.controller.mirror, env.heading_command(before))
+    residual = env.core.mirror_action(mirror, action)[2:].reshape(4, 3)
     shown = {
         "done": state.done > 0,
         "fell": (state.done > 0) & (state.info["truncation"] == 0),
         "progress": episode.progress,
         "over": jnp.sum(over & stance),
         "stance": jnp.sum(stance),
+        "swing": tg.path.leg_phases(before.controller.phase) > 0,
+        "swing_after": ~stance,
+        "at_limit": jnp.any(jnp.abs(residual) > AT_LIMIT, axis=-1),
+        "said": in_world(before, env.landing_points(before)),
+        "feet": in_world(episode, env.core.feet(envs.env.exact_sensors(episode))[:, :2]),
+        "command": episode.command,
     }
     return (state, memory, led), shown
 
 
+def in_world(episode: envs.Episode, points: jax.Array) -> jax.Array:
+    """Points (L, 2) m of the heading frame in the world."""
+    return episode.qpos[:2] + tg.frames.turn(tg.frames.yaw(episode.qpos[3:7]), points)
+
+
+def landing_errors(shown: dict[str, np.ndarray], landed: np.ndarray) -> dict[str, float]:
+    """How far (m) feet that stand since SETTLED steps are from where they were said to land, by steps before landing.
+
+    shown: arrays (T, B, ...); landed: (T, B, L), the step that ends a swing. Medians; and how far beyond what was said
+    they are along the command, on average, at one step before.
+    """
+    time, robot, leg = np.nonzero(landed[:-SETTLED])
+    stands = shown["feet"][time + SETTLED, robot, leg]
+    errors = {}
+    for steps in AHEAD:
+        then = np.maximum(time - steps + 1, 0)
+        swung = shown["swing"][then, robot, leg]
+        away = (stands - shown["said"][then, robot, leg])[swung]
+        errors[f"landing_error_{steps}_m"] = float(np.median(np.linalg.norm(away, axis=-1)))
+        if steps == 1:
+            along = np.sum(away * shown["command"][time, robot][swung], axis=-1)
+            errors["landed_beyond_m"] = float(along.mean())
+    return errors
+
+
 def measure(options: Options) -> dict[str, float]:
-    """Mean distance, and shares of the episodes that fell and of the feet in stance that are over a gap."""
+    """Mean distance, shares of episodes that fell, of feet in stance over a gap and of steps in swing at the limit of
+    residual angles, and errors of the predicted landing points.
+    """
     policy = load_policy(cli.find_policy(options.policy))
     env = make_env(policy, options)
     length = round(options.seconds / env.dt)
@@ -132,7 +171,10 @@ def measure(options: Options) -> dict[str, float]:
     last = (ended, np.arange(options.robots))
     # From beyond the start platform to each episode's end.
     counts = (np.arange(length)[:, None] <= ended) & (shown["progress"] > 0.6)
-    return {
+    landed = counts[..., None] & shown["swing"] & ~shown["swing_after"]
+    landed[:-SETTLED] &= counts[SETTLED:, :, None]
+    return landing_errors(shown, landed) | {
+        "residuals_at_limit": float(shown["at_limit"][shown["swing"] & counts[..., None]].mean()),
         "distance_m": float(np.minimum(shown["progress"][last], envs.GOAL).mean()),
         "fell": float(shown["fell"][last].mean()),
         "stance_over_gap": float(shown["over"][counts].sum() / max(shown["stance"][counts].sum(), 1)),

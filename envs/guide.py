@@ -24,6 +24,9 @@ GAIN = 0.3
 """Share of the way that one step asks for."""
 LIMIT = 0.12
 """Displacement (m) of a foot from the trajectory generator's path, forwards or sideways, beyond which it isn't sent."""
+SHORTER, CLOSER, OUTSIDE = 1.0, 0.3, 10.0
+"""What a metre of the way costs, one from the trajectory generator's path, and one beyond LIMIT; a place that is
+nothing but gap costs 1."""
 LIFTING = 0.3
 """Phase (rad) of swing up to which a foot isn't sent anywhere."""
 
@@ -48,8 +51,8 @@ def ways(env: QuadrupedEnv, episode: Episode) -> jax.Array:
     displacement = env.core.residual_displacement(episode.controller, exact_sensors(episode))
     moved = displacement[:, None, :2] + places()
     beyond = jnp.maximum(jnp.max(jnp.abs(moved), axis=-1) - LIMIT, 0.0)
-    # A gap counts most; then the shorter way, and the place nearer to the trajectory generator's path.
-    cost = gaps + np.linalg.norm(places(), axis=-1) + 0.3 * jnp.linalg.norm(moved, axis=-1) + 10.0 * beyond
+    cost = gaps + SHORTER * np.linalg.norm(places(), axis=-1) + CLOSER * jnp.linalg.norm(moved, axis=-1)
+    cost = cost + OUTSIDE * beyond
     best = jnp.asarray(places(), jnp.float32)[jnp.argmin(cost, axis=1)]
     # Where nothing is wrong with the ground, nothing is to be changed.
     best = jnp.where((jnp.max(gaps, axis=1) > 0.0)[:, None], best, 0.0)
@@ -58,16 +61,19 @@ def ways(env: QuadrupedEnv, episode: Episode) -> jax.Array:
     return jnp.where((swing & walking)[:, None], best, 0.0)
 
 
-def guide(env: QuadrupedEnv, episode: Episode) -> jax.Array:
-    """Change of the action (14,) that moves feet in swing a share of the way to better ground."""
-    core, sensors = env.core, exact_sensors(episode)
-    up = tg.frames.up_in_trunk(sensors.orientation)
-    target = episode.controller.targets[0].reshape(4, 3)
-    shift = jnp.pad(GAIN * ways(env, episode), ((0, 0), (0, 1))) @ tg.frames.heading_from_trunk(up)
-    angles = tg.leg.inverse(core.geometry, target + shift) - tg.leg.inverse(core.geometry, target)
+def change(env: QuadrupedEnv, episode: Episode, target: jax.Array, shift: jax.Array) -> jax.Array:
+    """Change of the action (14,) that moves the feet from `target` (L, 3) m, trunk frame, by `shift` (L, 2) m, level."""
+    core, up = env.core, tg.frames.up_in_trunk(exact_sensors(episode).orientation)
+    moved = target + jnp.pad(shift, ((0, 0), (0, 1))) @ tg.frames.heading_from_trunk(up)
+    angles = tg.leg.inverse(core.geometry, moved) - tg.leg.inverse(core.geometry, target)
     residual = (angles / core.config.residual_range).reshape(-1)
     mirror = core.update_mirror(episode.controller.mirror, env.heading_command(episode))
-    return core.mirror_action(mirror, jnp.concatenate([jnp.zeros(2), jnp.clip(residual, -1.0, 1.0)]))
+    return core.mirror_action(mirror, jnp.concatenate([jnp.zeros(2), residual]))
+
+
+def guide(env: QuadrupedEnv, episode: Episode) -> jax.Array:
+    """Change of the action (14,) that moves feet in swing a share of the way to better ground."""
+    return change(env, episode, episode.controller.targets[0].reshape(4, 3), GAIN * ways(env, episode))
 
 
 class Guided(Wrapper):

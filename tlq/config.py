@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import tg
-from envs.config import METHODS
+from envs.config import METHODS, EnvConfig
 from tlq.cli import UsageError, unknown
 from tlq.files import whole
 from tlq.networks import NetworkConfig
@@ -290,6 +290,12 @@ def _resumed(data: dict[str, Any], overrides: Sequence[str]) -> dict[str, Any]:
             new, old = new[name], old[name]
         old[last] = new[last]
     return saved
+
+
+def training_env(metadata: dict[str, Any]) -> Any:
+    """The `envs.EnvConfig` in which a policy was trained, from its file's metadata."""
+    env = metadata["training"]["env"]
+    return build(EnvConfig, env | {"tg": tg.BEFORE | env["tg"]})
 
 
 def build(cls: Any, data: dict[str, Any]) -> Any:

@@ -25,8 +25,9 @@ from typing import Any, NoReturn
 
 import numpy as np
 
-from tlq.cli import find_policy, option, parse, run
+from tlq.cli import check_folders, find_policy, option, parse, run
 from tlq.faults import BadLine
+from tlq.judge import GOAL
 from tlq.messages import LARGEST, MessageError, Sensing, Targets, unpack
 from tlq.runtime import Controller
 from tlq.supervisor import Mode, Supervisor
@@ -34,8 +35,6 @@ from tlq.supervisor import Mode, Supervisor
 ROLES = ("both", "policy")
 PD_PERIOD = 0.002
 """Of the joints' controllers (s)."""
-GOAL = 5.0
-"""Where the walk ends, and the robot is told to stand (m); the terrains aren't much longer."""
 START_LIMIT, STOP_LIMIT = 60.0, 5.0
 """Time in which the policy's process must have started, and must have ended when told to (s)."""
 _KEPT = 100_000  # measurements of each kind
@@ -273,7 +272,8 @@ class Robot:
 
 def _simulation(options: Options) -> Any:
     import terrains
-    from tlq.evaluate import FIRST_SEED, training_env
+    from tlq.config import training_env
+    from tlq.evaluate import FIRST_SEED
     from tlq.simulation import Simulation
 
     controller = Controller(find_policy(options.policy))
@@ -385,8 +385,7 @@ def check(options: Options) -> None:
         raise ValueError(f"direction={options.direction} must be a finite number of degrees")
     if options.seed < 0:
         raise ValueError(f"seed={options.seed} must be 0 or more")
-    if options.json and not Path(options.json).absolute().parent.is_dir():
-        raise ValueError(f"json={options.json}: there is no folder {Path(options.json).absolute().parent}")
+    check_folders(options, "json")
 
 
 def _stop(*_: Any) -> NoReturn:

@@ -21,10 +21,9 @@ import numpy as np
 
 import envs
 import terrains
-import tg
 from tlq import judge
 from tlq.cli import check_folders, find_policy, option, parse, run
-from tlq.config import build
+from tlq.config import training_env
 from tlq.files import whole
 from tlq.runtime import Controller, load_policy
 
@@ -94,12 +93,6 @@ def direction(k: int) -> np.ndarray:
 def start_phase(k: int) -> float:
     """Phase (rad) of episode k: one pair of legs swings first in one round of directions, the other in the next."""
     return 0.5 * math.pi * (-1) ** (k // len(DIRECTIONS))
-
-
-def training_env(metadata: dict[str, Any]) -> envs.EnvConfig:
-    """The environment a policy was trained in."""
-    env = metadata["training"]["env"]
-    return build(envs.EnvConfig, env | {"tg": tg.BEFORE | env["tg"]})
 
 
 def _walk_mjx(options: Options, path: Path, metadata: dict[str, Any], report: Any) -> list[judge.Tally]:

@@ -19,7 +19,8 @@ import terrains
 import tg
 from tlq import cli, judge
 from tlq.cli import find_policy, option
-from tlq.evaluate import FIRST_SEED, training_env
+from tlq.config import training_env
+from tlq.evaluate import FIRST_SEED
 from tlq.files import whole
 from tlq.runtime import Controller
 from tlq.simulation import Simulation

@@ -87,12 +87,16 @@ def ppo_loss(
     }
 
 
+LARGEST = 0.95
+"""Mean action that a guide may lead to; at 1 the action before tanh would be infinite."""
+
+
 def _guide_loss(rollout: Rollout, parameters: jax.Array) -> jax.Array:
     """Mean square distance (), summed over the angles, of the mean action from what the guide made of the old one.
 
     Only where the guide asks for something. parameters: (T, B, 2 A), of the new policy.
     """
     mean, old = (jnp.tanh(jnp.split(p, 2, axis=-1)[0]) for p in (parameters, rollout.parameters))
-    wanted = jnp.clip(old + rollout.guide, -0.95, 0.95)
+    wanted = jnp.clip(old + rollout.guide, -LARGEST, LARGEST)
     asked = jnp.abs(rollout.guide) > 0
     return jnp.mean(jnp.sum(jnp.where(asked, jnp.square(mean - wanted), 0.0), axis=-1))

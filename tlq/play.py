@@ -19,7 +19,8 @@ import numpy as np
 import terrains
 from tlq import render, viewer
 from tlq.cli import check_folders, find_policy, option, parse, run
-from tlq.evaluate import FIRST_SEED, training_env
+from tlq.config import training_env
+from tlq.evaluate import FIRST_SEED
 from tlq.judge import GOAL
 from tlq.runtime import Controller, load_policy
 from tlq.session import Session

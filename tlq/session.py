@@ -18,7 +18,8 @@ from envs.robot import RobotConfig
 from terrains import Terrain
 from tlq import render
 from tlq.cli import find_policy
-from tlq.evaluate import FIRST_SEED, training_env
+from tlq.config import training_env
+from tlq.evaluate import FIRST_SEED
 from tlq.insight import RewardMeter
 from tlq.runtime import Controller, PolicyFileError
 from tlq.simulation import Simulation

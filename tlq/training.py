@@ -21,7 +21,7 @@ from brax.envs.wrappers.training import VmapWrapper
 import tg
 from tlq import memory
 from tlq.checkpoint import Checkpoints, names, read_arrays
-from tlq.config import TrainConfig, load_config, save_config
+from tlq.config import TrainConfig, load_config, save_config, training_env
 from tlq.export import commit
 from tlq.logger import Logger
 from tlq.networks import make_networks
@@ -192,8 +192,6 @@ def initialise(state: TrainState, source: str, config: TrainConfig | None = None
         with np.load(path) as file:
             arrays = {k: file[k] for k in file.files}
         if "metadata" in arrays:
-            from tlq.evaluate import training_env
-
             before = training_env(json.loads(str(arrays["metadata"])))
     if config is not None and config.env is not None and before is not None:
         ratio = before.tg.residual_range / config.env.tg.residual_range

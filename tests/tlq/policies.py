@@ -13,6 +13,17 @@ from tlq.config import TrainConfig, default_config, replace
 from tlq.networks import make_networks
 
 
+def put(value, index):
+    """A change of an array: another value at an index."""
+
+    def change(array):
+        array = np.array(array, float)
+        array[index] = value
+        return array
+
+    return change
+
+
 @dataclasses.dataclass(frozen=True)
 class Trained:
     """What a trainer hands to the export."""

@@ -18,10 +18,11 @@ import numpy as np
 import pytest
 
 import terrains
+import tg
 from tests.tlq.policies import trained
 from tlq import deploy
 from tlq.cli import UsageError, find_policy
-from tlq.evaluate import training_env
+from tlq.config import training_env
 from tlq.faults import BadLine
 from tlq.messages import MessageError, Sensing, Targets, unpack
 from tlq.runtime import Controller, PolicyFileError, load_policy
@@ -260,6 +261,36 @@ def walk_in_parallel(path, episodes, share):
     with concurrent.futures.ProcessPoolExecutor(2, mp_context=context) as pool:
         one, other = pool.map(walk, [path] * 2, parts, [share] * 2)
     return one + other
+
+
+def test_heights_are_asked_for_where_the_next_step_wants_them(file):
+    """A control period ahead, so not to the millimetre: near what the controller would choose with its new sensors."""
+    controller = Controller(file)
+    flat = terrains.make_terrain("flat", "paper", 0)
+    sim = Simulation(controller, flat, training_env(controller.metadata), timestep=0.005)
+    supervisor, core = Supervisor(controller), controller.core
+    assert np.isnan(supervisor.centres()).all()
+    errors, ahead = [], []
+    for step in range(60):
+        now = 1.0 + step * controller.control_dt
+        message = Sensing(
+            step, round(1e9 * now), command=np.array([1.0, 0]), heights=sim.heights, **sim.sensors
+        )
+        desired = supervisor.step(message, now)
+        centres = supervisor.centres()
+        for _ in range(sim.substeps):
+            sim.substep(desired)
+        sim.look(centres)
+        swing = tg.path.leg_phases(controller.state.phase) > 0
+        np.testing.assert_array_equal(np.isnan(centres), np.stack([~swing, ~swing], axis=-1))
+        sensors, feet = sim.exact_sensors(), core.feet(sim.exact_sensors())[:, :2]
+        np.testing.assert_allclose(
+            sim.points, core.around(np.where(np.isnan(centres), feet, centres)), atol=1e-6
+        )
+        wanted = core.centres(controller.state, sensors)
+        errors += list(np.linalg.norm(centres - wanted, axis=1)[swing])
+        ahead += list(np.linalg.norm(wanted - feet, axis=1)[swing])
+    assert np.median(errors) < 0.01 < 0.04 < np.median(ahead)
 
 
 def test_some_episodes_over_a_bad_line(file):

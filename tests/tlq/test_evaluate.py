@@ -16,6 +16,7 @@ import terrains
 from tests.tlq.policies import trained
 from tlq import cli, evaluate, judge
 from tlq.cli import UsageError, parse
+from tlq.config import training_env
 from tlq.runtime import Controller
 from tlq.simulation import Simulation, noisy
 
@@ -206,7 +207,7 @@ def test_mujoco_repeats_itself(file):
 def test_robot_stands_at_rest_on_command_zero(file):
     controller = Controller(file)
     simulation = Simulation(
-        controller, terrains.make_terrain("flat", 0.0, 0), evaluate.training_env(controller.metadata)
+        controller, terrains.make_terrain("flat", 0.0, 0), training_env(controller.metadata)
     )
     for _ in range(50):
         moment = simulation.step(np.zeros(2))
@@ -218,7 +219,7 @@ def test_robot_stands_at_rest_on_command_zero(file):
 def test_a_robot_on_its_belly_or_side_has_fallen(file):
     controller = Controller(file)
     simulation = Simulation(
-        controller, terrains.make_terrain("flat", 0.0, 0), evaluate.training_env(controller.metadata)
+        controller, terrains.make_terrain("flat", 0.0, 0), training_env(controller.metadata)
     )
     assert not simulation.fell()
     simulation.data.qpos[2] = simulation.robot.trunk_half_size[2] - 0.01
@@ -270,7 +271,7 @@ def test_engines_are_the_same_at_the_same_settings(tmp_path):
 
     file = trained(spread=0.02).export(tmp_path / "policy.npz")
     controller, direction = Controller(file), evaluate.direction(1)
-    config, policy = evaluate.training_env(controller.metadata), load_policy(file)
+    config, policy = training_env(controller.metadata), load_policy(file)
     sizes = terrains.TerrainConfig(kind="flat", num_terrains=2, seed=evaluate.FIRST_SEED)
     env = envs.make(batch.evaluation_config(config, sizes, 0.8, noise=False))
     simulation = Simulation(controller, terrains.make_terrain("flat", "paper", 0), config, timestep=0.005)

@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 
 import tg
-from tests.tlq.policies import trained
+from tests.tlq.policies import put, trained
+from tlq.config import training_env
 from tlq.runtime import Controller, PolicyFileError, load_policy
 
 ABSENT = {"jax", "jaxlib", "flax", "brax", "mujoco", "hydra", "envs", "terrains", "rewards", "onnx"}
@@ -107,6 +108,17 @@ def test_example_sensors_stand(file):
     assert q_des.shape == (12,) and np.all(np.abs(q_des - controller.core.standing_target) < 0.31)
 
 
+def test_policies_from_before_look_ahead_sample_round_their_feet(file, tmp_path):
+    with np.load(file) as old:
+        arrays = {name: old[name] for name in old.files}
+    metadata = json.loads(str(arrays["metadata"]))
+    assert metadata["tg"].pop("look_ahead") and Controller(file).core.config.look_ahead
+    metadata["training"]["env"]["tg"].pop("look_ahead")
+    np.savez(tmp_path / "old.npz", **arrays | {"metadata": json.dumps(metadata)})
+    assert not Controller(tmp_path / "old.npz").core.config.look_ahead
+    assert not training_env(metadata).tg.look_ahead
+
+
 def test_blind_policies_need_no_heights(tmp_path):
     controller = Controller(trained("blind").export(tmp_path / "policy.npz"))
     assert controller.step(controller.example_sensors(), None, FORWARD).shape == (12,)
@@ -125,7 +137,7 @@ def test_needs_neither_jax_nor_mujoco(file):
 
 
 def test_a_step_takes_about_half_a_millisecond(file):
-    """0.46 ms where nothing else runs; the bound leaves room for slower and for busy machines."""
+    """Twice what is promised: the bound must hold on slow and on busy machines; a figure is not tested here."""
     controller = Controller(file)
     inputs = next(walk(controller, np.random.default_rng(3), 1))
     times = []
@@ -138,15 +150,6 @@ def test_a_step_takes_about_half_a_millisecond(file):
 
 
 # -- inputs ----------------------------------------------------------------------------------------------------------
-
-
-def put(value, index):
-    def change(array):
-        array = np.array(array, float)
-        array[index] = value
-        return array
-
-    return change
 
 
 @pytest.mark.parametrize(

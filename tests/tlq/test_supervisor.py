@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.tlq.policies import trained
+from tests.tlq.policies import put, trained
 from tlq.faults import BadLine, spoilt
 from tlq.messages import MessageError, Sensing, unpack
 from tlq.runtime import Controller
@@ -68,15 +68,6 @@ class Rig:
     @property
     def mode(self):
         return self.supervisor.mode
-
-
-def put(value, index):
-    def change(array):
-        array = np.array(array, float)
-        array[index] = value
-        return array
-
-    return change
 
 
 BAD = {
