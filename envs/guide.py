@@ -62,7 +62,7 @@ def ways(env: QuadrupedEnv, episode: Episode) -> jax.Array:
 
 
 def change(env: QuadrupedEnv, episode: Episode, target: jax.Array, shift: jax.Array) -> jax.Array:
-    """Change of the action (14,) that moves the feet from `target` (L, 3) m, trunk frame, by `shift` (L, 2) m, level."""
+    """Change of the action (14,) that moves the feet from `target` (L, 3) m in the trunk by `shift` (L, 2) m, level."""
     core, up = env.core, tg.frames.up_in_trunk(exact_sensors(episode).orientation)
     moved = target + jnp.pad(shift, ((0, 0), (0, 1))) @ tg.frames.heading_from_trunk(up)
     angles = tg.leg.inverse(core.geometry, moved) - tg.leg.inverse(core.geometry, target)

@@ -115,8 +115,8 @@ class Supervisor:
             return np.full((4, 2), np.nan)
         sensors = tg.Sensors(**self.last.sensors)
         swing = (tg.path.leg_phases(state.phase) > 0)[:, None]
-        # By then the trunk will have come nearer.
-        return np.where(swing, core.centres(state, sensors) - core.dt * state.velocity, np.nan)
+        # The state is a step ahead of the sensors: that is when the next ones will be read.
+        return np.where(swing, core.centres(state, sensors), np.nan)
 
     def fault(self, message: Sensing | None, now: float) -> str:
         """What is wrong with a message, in one word; empty if it can be acted on."""

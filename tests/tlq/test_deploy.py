@@ -290,7 +290,7 @@ def test_heights_are_asked_for_where_the_next_step_wants_them(file):
         wanted = core.centres(controller.state, sensors)
         errors += list(np.linalg.norm(centres - wanted, axis=1)[swing])
         ahead += list(np.linalg.norm(wanted - feet, axis=1)[swing])
-    assert np.median(errors) < 0.01 < 0.04 < np.median(ahead)
+    assert np.median(errors) < 0.008 < 0.04 < np.median(ahead)
 
 
 def test_some_episodes_over_a_bad_line(file):
