@@ -27,6 +27,7 @@ ON_THE_ROBOT = (
     "tlq/faults.py",
     "tlq/cli.py",
     "tlq/deploy.py",
+    "tlq/judge.py",
 )
 """What a robot needs of `tlq`: NumPy and `tg` alone, as soon as it is imported."""
 

@@ -263,9 +263,9 @@ def walk_in_parallel(path, episodes, share):
     return one + other
 
 
-def test_heights_are_asked_for_where_the_next_step_wants_them(file):
+def test_heights_are_asked_for_where_the_next_step_wants_them():
     """A control period ahead, so not to the millimetre: near what the controller would choose with its new sensors."""
-    controller = Controller(file)
+    controller = Controller(find_policy("poles"))
     flat = terrains.make_terrain("flat", "paper", 0)
     sim = Simulation(controller, flat, training_env(controller.metadata), timestep=0.005)
     supervisor, core = Supervisor(controller), controller.core
