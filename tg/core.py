@@ -25,7 +25,7 @@ HEIGHT_CLIP = 0.25
 TURN_CLIP = 0.5
 """The turn since the start is shown up to ± this (rad), so that a robot turned round by hand sees nothing new."""
 EARLY = 0.09
-"""Feet come down about this share of the step before its end: from rollouts of one policy, docs/experiments.md."""
+"""Share of the step that feet are taken to come down before its end; too much, see docs/experiments.md."""
 LAG = 0.07
 """Time constant (s) with which joints catch up with what is asked of them: from the same."""
 SMOOTHING = 0.3
