@@ -27,6 +27,7 @@ from jax.sharding import PartitionSpec as P  # noqa: E402
 import envs  # noqa: E402
 import terrains  # noqa: E402
 from benchmarks import timing  # noqa: E402
+from envs import guide  # noqa: E402
 from envs.env import exact_sensors  # noqa: E402
 from tlq import cli  # noqa: E402
 from tlq import config as settings  # noqa: E402
@@ -84,12 +85,14 @@ class Parts:
         """By name."""
         unroll = self.config.ppo.unroll
         steps = timing.env_steps(self.learner, unroll)
+        guided = "guide" in self.state.env_state.info
         return {
             "iteration": lambda: self.learner.step(self.state),
             "environment": lambda: steps(self.state.env_state),
             "physics": self.physics(unroll),
             "contact look-ups": self.repeated(self.contacts, unroll * self.env.substeps),
             "height look-ups": self.repeated(self.heights, unroll * HEIGHT_LOOK_UPS),
+            **({"guide": self.repeated(self.guide, unroll)} if guided else {}),
             "policy": self.policy(unroll),
             "update": self.update(),
         }
@@ -129,8 +132,12 @@ class Parts:
     def heights(self, e: envs.Episode) -> envs.Episode:
         """One look-up of 100 heights."""
         core = self.env.core
-        seen = self.env._heights(e, core.sample_points(core.feet(exact_sensors(e))))
+        seen = self.env._heights(e, core.around(core.feet(exact_sensors(e))))
         return e.replace(qpos=e.qpos + NOTHING * jnp.sum(seen))
+
+    def guide(self, e: envs.Episode) -> envs.Episode:
+        """What the guide to footholds asks for, once."""
+        return e.replace(qpos=e.qpos + NOTHING * jnp.sum(guide.guide(self.env, e)))
 
     def policy(self, steps: int) -> Callable[[], Any]:
         """The policy's steps, with sampling."""
@@ -163,8 +170,8 @@ class Parts:
 def measure(options: Options) -> dict[str, Any]:
     """Median seconds of each part, its share of the iteration, and steps per second."""
     seconds = timing.medians(Parts(options).all(), options.rounds)
-    known = ("physics", "contact look-ups", "height look-ups")
-    seconds["rest of the environment"] = seconds["environment"] - sum(seconds[k] for k in known)
+    known = ("physics", "contact look-ups", "height look-ups", "guide")
+    seconds["rest of the environment"] = seconds["environment"] - sum(seconds.get(k, 0.0) for k in known)
     steps = options.num_envs * options.unroll
     return {
         "training_steps_per_second": steps / seconds["iteration"],

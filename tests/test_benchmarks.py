@@ -1,0 +1,41 @@
+"""The benchmarks run, at sizes that say nothing of speed: what they measure is changed more often than they are run."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+SMALL = ["num_envs=16", "num_terrains=12", "rounds=1"]
+
+
+def result(name, arguments, folder):
+    """The JSON that a benchmark writes."""
+    command = [sys.executable, "-m", f"benchmarks.{name}", *arguments, f"json={folder / 'result.json'}"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=900, check=False)
+    assert done.returncode == 0, done.stderr
+    return json.loads((folder / "result.json").read_text())
+
+
+@pytest.mark.slow
+def test_breakdown(tmp_path):
+    shares = result("breakdown", [*SMALL, "unroll=2", "warm_up=1"], tmp_path)["share_of_iteration"]
+    parts = {"physics", "contact look-ups", "height look-ups", "guide", "policy", "update"}
+    assert shares["iteration"] == 1 and all(shares[part] > 0 for part in parts)
+
+
+@pytest.mark.slow
+def test_throughput(tmp_path):
+    found = result("throughput", SMALL, tmp_path)
+    assert found["env_vs_mujoco_c"] > 0 and found["training_vs_env"] > 0 and found["parameters"] > 100_000
+
+
+@pytest.mark.slow
+def test_footholds(tmp_path):
+    """Long enough for feet to land beyond the start platform."""
+    arguments = ["policy=flat", "difficulty=0.5", "robots=8", "seconds=2.5", "reflex=true"]
+    found = result("footholds", arguments, tmp_path)
+    assert 0.5 < found["distance_m"] <= 5 and 0 <= found["stance_over_gap"] <= 1
+    assert 0 < found["landing_error_1_m"] < found["landing_error_8_m"] < 0.2
