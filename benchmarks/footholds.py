@@ -3,9 +3,8 @@
     python -m benchmarks.footholds policy=flat difficulty=0.5 reflex=false
     python -m benchmarks.footholds policy=flat difficulty=0.5 reflex=true depth=0.5 json=FILE
 
-The reflex follows the guide (envs/guide.py): for each foot in swing it looks for the nearest ground without a gap round
-the point where the foot will come down, and leads the foot there by inverse kinematics, on top of the policy's residual
-joint angles: a share of the way at each step, kept until the next swing. It knows the true map.
+The reflex is the guide (envs/guide.py): a foot in swing whose step ends near a gap is led to better ground by inverse
+kinematics, in place of the policy's residual joint angles. It knows the true map.
 
 Episodes as in training, in MJX, on terrains that training never saw: noise and randomisation but no pushes, all walk;
 an episode ends with a foot in a gap, a fall, or at 5 m.
@@ -42,8 +41,6 @@ SETTLED = 3
 """Control steps after which a foot stands."""
 AT_LIMIT = 0.9
 """Residual action from which it counts as being at its limit, 1."""
-DROP = 0.6
-"""Phase (rad) up to which a foot that lifts off forgets where it was led, by a tenth each step."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,7 +52,6 @@ class Options:
     difficulty: float = cli.option(0.5, "in [0, 1]")
     depth: float = cli.option(0.02, "of the pits for the feet (m)")
     reflex: bool = cli.option(False, "lead the feet by the reflex")
-    gain: float = cli.option(guide.GAIN, "share of the way to the best foothold at each step")
     robots: int = cli.option(96, "episodes, two on each terrain")
     seconds: float = cli.option(8.0, "longest episode")
     json: str = cli.option("", "file for the result")
@@ -79,34 +75,21 @@ def make_env(policy: Policy, options: Options) -> envs.QuadrupedEnv:
     return envs.make(config)
 
 
-def lead(env: envs.QuadrupedEnv, episode: envs.Episode, led: jax.Array, gain: float) -> jax.Array:
-    """Where the reflex leads the feet: displacements (L, 2) m in the heading frame, from those of the step before."""
-    led = jnp.clip(led + gain * guide.ways(env, episode), -guide.LIMIT, guide.LIMIT)
-    phases = tg.path.leg_phases(episode.controller.phase)[:, None]
-    return jnp.where((phases > 0) & (phases < DROP), 0.9 * led, led)
-
-
-def with_reflex(
-    env: envs.QuadrupedEnv, episode: envs.Episode, action: jax.Array, led: jax.Array
-) -> jax.Array:
-    """The policy's action (14,) with residual joint angles that move the feet by `led` (L, 2) m."""
-    controller, sensors = episode.controller, envs.env.exact_sensors(episode)
-    phases = tg.path.leg_phases(controller.phase)
-    lift = controller.lift * controller.gate
-    target = env.core.foot_targets(phases, lift, controller.stride, sensors)
-    return jnp.clip(action + guide.change(env, episode, target, led), -1.0, 1.0)
+def with_reflex(env: envs.QuadrupedEnv, episode: envs.Episode, action: jax.Array) -> jax.Array:
+    """The policy's action (14,) with the guide's wishes in place of its own where that has any."""
+    wished = guide.guide(env, episode)
+    return jnp.where(jnp.isnan(wished), action, jnp.clip(wished, -1.0, 1.0))
 
 
 def step(
-    policy: Policy, env: envs.QuadrupedEnv, options: Options, carried: tuple[Any, jax.Array, jax.Array]
-) -> tuple[tuple[Any, jax.Array, jax.Array], dict[str, jax.Array]]:
+    policy: Policy, env: envs.QuadrupedEnv, options: Options, carried: tuple[Any, jax.Array]
+) -> tuple[tuple[Any, jax.Array], dict[str, jax.Array]]:
     """One control step of one robot, and what it shows."""
-    state, memory, led = carried
+    state, memory = carried
     episode = state.pipeline_state
     action, memory = policy.graph(state.obs["state"], memory)
     if options.reflex:
-        led = lead(env, episode, led, options.gain)
-        action = with_reflex(env, episode, action, led)
+        action = with_reflex(env, episode, action)
     state = env.step(state, action)
     before, episode = episode, state.pipeline_state
     _, around = env._terrain_at_feet(episode)
@@ -127,7 +110,7 @@ def step(
         "feet": in_world(episode, env.core.feet(envs.env.exact_sensors(episode))[:, :2]),
         "command": episode.command,
     }
-    return (state, memory, led), shown
+    return (state, memory), shown
 
 
 def in_world(episode: envs.Episode, points: jax.Array) -> jax.Array:
@@ -164,7 +147,7 @@ def measure(options: Options) -> dict[str, float]:
     length = round(options.seconds / env.dt)
     one = jax.vmap(functools.partial(step, policy, env, options))
     state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(1), options.robots))
-    start = (state, jnp.zeros((options.robots, policy.memory_size)), jnp.zeros((options.robots, 4, 2)))
+    start = (state, jnp.zeros((options.robots, policy.memory_size)))
     run = jax.jit(lambda carried: jax.lax.scan(lambda c, _: one(c), carried, length=length)[1])
     shown = {name: np.asarray(x) for name, x in run(start).items()}
     ended = np.where(shown["done"].any(axis=0), shown["done"].argmax(axis=0), length - 1)

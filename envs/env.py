@@ -289,7 +289,7 @@ class QuadrupedEnv(Env):
         """The critic's observation: the policy's, 100 heights where it has none, and 44 values it can't know."""
         r, mirror = episode.randomised, self.core.update_mirror(episode.controller.mirror, command)
         side = jnp.stack([jnp.ones_like(mirror), mirror])
-        velocity = tg.frames.turn(-tg.frames.yaw(episode.qpos[3:7]), episode.qvel[:2])
+        velocity = self.velocity(episode)
         below = self.core.feet(exact_sensors(episode))[:, 2] - true[:, 0]
         order = jnp.where(mirror > 0, jnp.arange(4), jnp.array([1, 0, 3, 2]))
         # How much of each circle round a foot is a gap: what the foot is about to earn, put plainly.
@@ -432,8 +432,15 @@ class QuadrupedEnv(Env):
 
     def landing_points(self, episode: Episode) -> jax.Array:
         """Where the feet (L, 2) m in swing will come down, from the trunk's centre, heading frame: `Core`'s, exact."""
-        velocity = tg.frames.turn(-tg.frames.yaw(episode.qpos[3:7]), episode.qvel[:2])
-        return self.core.landing_points(episode.controller, exact_sensors(episode), velocity)
+        return self.core.landing_points(episode.controller, exact_sensors(episode), self.velocity(episode))
+
+    def step_ends(self, episode: Episode) -> jax.Array:
+        """Where the trajectory generator leads the feet (L, 2) m in swing, in the same frame: `Core`'s, exact."""
+        return self.core.step_ends(episode.controller, exact_sensors(episode), self.velocity(episode))
+
+    def velocity(self, episode: Episode) -> jax.Array:
+        """The trunk's (2,) m/s, heading frame."""
+        return tg.frames.turn(-tg.frames.yaw(episode.qpos[3:7]), episode.qvel[:2])
 
     def _aim(self, episode: Episode, around: jax.Array) -> jax.Array:
         """Minus the share (L,) of low points where a foot in swing will come down; 0 in stance.

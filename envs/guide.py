@@ -1,8 +1,9 @@
-"""Where feet in swing had better go: a change of the action that training can imitate. It learns nothing itself.
+"""Where feet in swing had better go: joint angles that training can imitate. It learns nothing itself.
 
-For each foot in swing, the true ground round the point where the foot will come down is searched for the nearest place
-without a gap; the guide asks for a share of the way there, by inverse kinematics. The policy-gradient finds out only by
-trial which of twelve joint angles would have saved a footstep; this tells it (`ppo.guide` is the weight).
+For each foot in swing, the true ground round the end of its step is searched for the place where a foot that lands with
+some error hits no gap; the guide says which residual joint angles lead there, all the way, and from early in the swing on.
+The policy-gradient finds out only by trial which of twelve joint angles would have saved a footstep; this tells it
+(`ppo.guide` is the weight).
 """
 
 from typing import cast
@@ -16,68 +17,126 @@ import tg
 from envs.env import QuadrupedEnv, exact_sensors
 from envs.types import Episode
 
-CELL = 0.02
+CELL = 0.025
 """Spacing (m) of the points whose heights are compared."""
 REACH = 5
-"""A foot can be sent this many cells to each side of where it will come down."""
-GAIN = 0.3
-"""Share of the way that one step asks for."""
-LIMIT = 0.12
-"""Displacement (m) of a foot from the trajectory generator's path, forwards or sideways, beyond which it isn't sent."""
-SHORTER, CLOSER, OUTSIDE = 1.0, 0.3, 10.0
-"""What a metre of the way costs, one from the trajectory generator's path, and one beyond LIMIT; a place that is
-nothing but gap costs 1."""
+"""A foot can be sent this many cells to each side of the end of its step."""
+ERROR = 0.025
+"""Standard deviation (m) of a landing foot from its place, by which the gaps near a place count."""
+NEAR = 2
+"""Cells to each side of a place that count."""
+FARTHER, ANOTHER = 2.0, 0.5
+"""What a metre costs from where balance wants the foot, and one from where it is led already; a place that is nothing but
+gap costs 1."""
+BALANCE = 0.15
+"""Seconds of the trunk's excess speed that a foot is placed farther along, as a walking inverted pendulum asks for."""
+AWAY = 0.1
+"""Largest displacement (m) for balance."""
+SAFE = 0.02
+"""Share of gap up to which a place is left alone."""
 LIFTING = 0.3
 """Phase (rad) of swing up to which a foot isn't sent anywhere."""
+ARRIVED = 1.5
+"""Phase (rad) from which it is led all the way to its place; a share of it before, as joints that jump upset the trunk."""
+LEGS_IN_SWING = 2
+"""At most, in a trot: more than these aren't looked at."""
 
 
 def places() -> np.ndarray:
-    """((2 REACH + 1)^2, 2) m, where a foot may be sent from its landing point."""
+    """((2 REACH + 1)^2, 2) m, where a foot may be sent from the end of its step."""
     axis = np.arange(-REACH, REACH + 1) * CELL
     return np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2)
 
 
-def ways(env: QuadrupedEnv, episode: Episode) -> jax.Array:
-    """From where each foot will come down to the best place near it: (L, 2) m, heading frame; zero in stance."""
-    axis = np.arange(-REACH - 1, REACH + 2) * CELL
+def weights() -> np.ndarray:
+    """(2 NEAR + 1, 2 NEAR + 1), how much the ground so many cells from a place counts; they sum to 1."""
+    axis = np.exp(-0.5 * np.square(np.arange(-NEAR, NEAR + 1) * CELL / ERROR))
+    return np.outer(axis, axis) / np.sum(axis) ** 2
+
+
+def displacements(env: QuadrupedEnv, episode: Episode) -> tuple[jax.Array, jax.Array]:
+    """Where the feet had better be led, and whether they are to be led at all.
+
+    Returns:
+      Displacement (L, 2) m from the trajectory generator's path, heading frame, and (L,) bool: not in stance, nor where
+      the ground has no gap near the end of the step, neither with the foot's displacement so far nor without.
+    """
+    controller, sensors = episode.controller, exact_sensors(episode)
+    phases = tg.path.leg_phases(controller.phase)
+    _, legs = jax.lax.top_k(phases, LEGS_IN_SWING)
+    ends = env.step_ends(episode)[legs]
+    axis = np.arange(-REACH - NEAR, REACH + NEAR + 1) * CELL
     patch = jnp.asarray(np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1), jnp.float32)
-    heights = env._heights(episode, env.landing_points(episode)[:, None, None] + patch)  # (L, N + 2, N + 2)
-    # A place is as good as the nine points on and around it.
+    heights = env._heights(episode, ends[:, None, None] + patch)
     highest = jnp.max(heights, axis=(1, 2), keepdims=True)
     low = (highest - heights > env.config.rewards.gap_threshold).astype(jnp.float32)
     n = 2 * REACH + 1
-    near = jnp.stack([low[:, i : i + n, j : j + n] for i in range(3) for j in range(3)])
-    gaps = jnp.mean(near, axis=0).reshape(4, -1)
-    displacement = env.core.residual_displacement(episode.controller, exact_sensors(episode))
-    moved = displacement[:, None, :2] + places()
-    beyond = jnp.maximum(jnp.max(jnp.abs(moved), axis=-1) - LIMIT, 0.0)
-    cost = gaps + SHORTER * np.linalg.norm(places(), axis=-1) + CLOSER * jnp.linalg.norm(moved, axis=-1)
-    cost = cost + OUTSIDE * beyond
+    # Separable: first along one axis, then along the other.
+    line = np.sqrt(np.diag(weights()))
+    rows = sum(w * low[:, i : i + n] for i, w in enumerate(line))
+    gaps = sum(w * rows[:, :, i : i + n] for i, w in enumerate(line)).reshape(len(legs), -1)
+    now = env.core.residual_displacement(controller, sensors)[legs, :2]
+    share = tg.path.smoothstep(jnp.clip((phases[legs] - LIFTING) / (ARRIVED - LIFTING), 0.0, 1.0))[:, None]
+    now = jnp.clip(now / jnp.maximum(share, 0.3), -REACH * CELL, REACH * CELL)
+    away = jnp.linalg.norm(now[:, None] - places(), axis=-1)
+    # The mean speed of feet in stance.
+    speed = 2.0 * controller.frequency * env.core.config.step_length
+    ahead = jnp.clip(BALANCE * (env.velocity(episode) - speed * controller.stride), -AWAY, AWAY)
+    far = jnp.linalg.norm(ahead - places(), axis=-1)
+    cost = gaps + FARTHER * far + ANOTHER * away
     best = jnp.asarray(places(), jnp.float32)[jnp.argmin(cost, axis=1)]
-    # Where nothing is wrong with the ground, nothing is to be changed.
-    best = jnp.where((jnp.max(gaps, axis=1) > 0.0)[:, None], best, 0.0)
-    swing = tg.path.leg_phases(episode.controller.phase) > LIFTING
+    here = jnp.take_along_axis(gaps, jnp.argmin(away, axis=1)[:, None], axis=1)[:, 0]
+    danger = jnp.maximum(here, gaps[:, len(places()) // 2]) > SAFE
     walking = jnp.sum(jnp.square(episode.command)) > 0.5
-    return jnp.where((swing & walking)[:, None], best, 0.0)
+    asked = danger & (phases[legs] > LIFTING) & walking
+    led = jnp.zeros((4, 2)).at[legs].set(share * best)
+    return led, jnp.zeros(4, bool).at[legs].set(asked)
 
 
-def change(env: QuadrupedEnv, episode: Episode, target: jax.Array, shift: jax.Array) -> jax.Array:
-    """Change of the action (14,) that moves the feet from `target` (L, 3) m in the trunk by `shift` (L, 2) m, level."""
-    core, up = env.core, tg.frames.up_in_trunk(exact_sensors(episode).orientation)
-    moved = target + jnp.pad(shift, ((0, 0), (0, 1))) @ tg.frames.heading_from_trunk(up)
-    angles = tg.leg.inverse(core.geometry, moved) - tg.leg.inverse(core.geometry, target)
-    residual = (angles / core.config.residual_range).reshape(-1)
-    mirror = core.update_mirror(episode.controller.mirror, env.heading_command(episode))
-    return core.mirror_action(mirror, jnp.concatenate([jnp.zeros(2), residual]))
+def residuals(env: QuadrupedEnv, episode: Episode, displacement: jax.Array) -> jax.Array:
+    """Residual actions (L, 3) that lead the feet past the coming step's path by `displacement` (L, 2) m, level."""
+    target, level = _target(env, episode)
+    moved = target + jnp.pad(displacement, ((0, 0), (0, 1))) @ level
+    geometry = env.core.geometry
+    return (tg.leg.inverse(geometry, moved) - tg.leg.inverse(geometry, target)) / env.core.config.residual_range
+
+
+def _target(env: QuadrupedEnv, episode: Episode) -> tuple[jax.Array, jax.Array]:
+    """The trajectory generator's next foot targets (L, 3) m, trunk frame, and (3, 3) `heading_from_trunk`."""
+    core, controller, sensors = env.core, episode.controller, exact_sensors(episode)
+    phase = tg.path.advance(controller.phase, controller.frequency, core.dt)
+    lift = controller.lift * controller.gate
+    target = core.foot_targets(tg.path.leg_phases(phase), lift, controller.stride, sensors)
+    return target, tg.frames.heading_from_trunk(tg.frames.up_in_trunk(sensors.orientation))
 
 
 def guide(env: QuadrupedEnv, episode: Episode) -> jax.Array:
-    """Change of the action (14,) that moves feet in swing a share of the way to better ground."""
-    return change(env, episode, episode.controller.targets[0].reshape(4, 3), GAIN * ways(env, episode))
+    """The guide's wish for the next action: (L, 2, 4), zero where it has none.
+
+    Of leg l, [:, :3] is how far (m) its residual actions move the foot, forwards and left, and [:, 3] how far they should.
+    The leg's height is left to the policy. Legs and sides are the policy's, mirrored if its observation is.
+    """
+    led, asked = displacements(env, episode)
+    target, level = _target(env, episode)
+    # Half way there the slope is that of the whole way.
+    half = tg.leg.inverse(env.core.geometry, target + 0.5 * jnp.pad(led, ((0, 0), (0, 1))) @ level)
+
+    def feet(angles: jax.Array) -> jax.Array:
+        return tg.leg.forward(env.core.geometry, angles) @ level.T
+
+    def turned(joint: int) -> jax.Array:
+        return jax.jvp(feet, (half,), (jnp.zeros_like(half).at[:, joint].set(1.0),))[1]
+
+    slope = env.core.config.residual_range * jnp.stack([turned(j) for j in range(3)], axis=-1)[:, :2]
+    wish = jnp.where(asked[:, None, None], jnp.concatenate([slope, led[..., None]], axis=-1), 0.0)
+    mirror = env.core.update_mirror(episode.controller.mirror, env.heading_command(episode))
+    # In the mirror left is right, and the abduction joints turn the other way.
+    other = wish[jnp.array([1, 0, 3, 2])] * jnp.asarray([[-1.0, 1.0, 1.0, 1.0], [1.0, -1.0, -1.0, -1.0]])
+    return jnp.where(mirror > 0, wish, other)
 
 
 class Guided(Wrapper):
-    """An environment whose state's info has, as 'guide' (14,), what the guide would change of the next action."""
+    """An environment whose state's info has, as 'guide' (L, 2, 4), the guide's wish for the next action."""
 
     def __init__(self, env: Env):
         super().__init__(env)

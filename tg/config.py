@@ -28,8 +28,8 @@ class TGConfig:
     """Lower bound of H + δh (m)."""
     lift_max: float = 0.14
     """Upper bound of H + δh (m): higher than this the knee limit is reached."""
-    residual_range: float = 0.3
-    """Residual joint angle at action ±1 (rad); small enough that residuals cannot cancel a whole step."""
+    residual_range: float = 0.4
+    """Residual joint angle at action ±1 (rad): a foot can be moved by 11 cm, half the distance between thin poles."""
     levelling: float = 1.0
     """Share of the trunk's roll and pitch that is taken out of the feet's base positions. 1 is the paper's horizontal
     frame: the feet stay straight below the hips, but the stance legs no longer turn the trunk back to level. The

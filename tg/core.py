@@ -24,8 +24,8 @@ HEIGHT_CLIP = 0.25
 """Heights below the foot are cut to ± this (m): deeper than that, a hole is a hole."""
 TURN_CLIP = 0.5
 """The turn since the start is shown up to ± this (rad), so that a robot turned round by hand sees nothing new."""
-EARLY = 0.09
-"""Share of the step that feet are taken to come down before its end; too much, see docs/experiments.md."""
+EARLY = 0.06
+"""Share of the step that feet come down before its end: measured (docs/experiments.md)."""
 LAG = 0.07
 """Time constant (s) with which joints catch up with what is asked of them: from the same."""
 SMOOTHING = 0.3
@@ -162,12 +162,12 @@ class Core:
         return self.around(self.centres(state, sensors))
 
     def centres(self, state: ControllerState, sensors: Sensors) -> Array:
-        """Centres (4, 2) m of the circles of `sample_points`: the feet, or where those in swing land (`look_ahead`)."""
+        """Centres (4, 2) m of the circles of `sample_points`: the feet, or where their steps end (`look_ahead`)."""
         feet = self.feet(sensors)[:, :2]
         if not self.config.look_ahead:
             return feet
         xp = feet.__array_namespace__()
-        landing = self.landing_points(state, sensors, self.odometry(state, sensors))
+        landing = self.step_ends(state, sensors, self.odometry(state, sensors))
         # A robot that stands still has feet in swing by their phase, but they stay where they are.
         share = xp.where(path.leg_phases(state.phase) > 0, state.gate, 0.0 * state.gate)[:, None]
         return feet + share * (landing - feet)
@@ -202,23 +202,36 @@ class Core:
         level = frames.heading_from_trunk(frames.up_in_trunk(sensors.orientation))
         return (xp.reshape(state.targets[0], (4, 3)) - target) @ level.T
 
+    def step_ends(self, state: ControllerState, sensors: Sensors, velocity: Array) -> Array:
+        """Where the trajectory generator leads feet in swing: (4, 2) m from the trunk's centre, heading frame.
+
+        The end of the step less EARLY, and the trunk's way until then at its velocity (2,) m/s. Residual joint angles are
+        left out, so that a foothold seen from there stays where it is while they lead the foot to it.
+        """
+        xp = state.targets.__array_namespace__()
+        level = frames.heading_from_trunk(frames.up_in_trunk(sensors.orientation))
+        end = (0.5 - EARLY) * self.config.step_length * state.stride
+        place = (self.geometry.hip_position @ level.T + self.base_foot)[:, :2]
+        return place + end + self._time_left(state, xp)[:, None] * velocity
+
     def landing_points(self, state: ControllerState, sensors: Sensors, velocity: Array) -> Array:
         """Where feet in swing will come down: (4, 2) m from the trunk's centre, heading frame.
 
-        The end of the trajectory generator's step less EARLY, the trunk's way until then at its velocity (2,) m/s, the
-        displacement by the residual joint angles, which are taken to stay as they are, and what will be left of the
-        joints' lag.
+        `step_ends`, the displacement by the residual joint angles, which are taken to stay as they are, and what will be
+        left of the joints' lag.
         """
         xp = state.targets.__array_namespace__()
-        phases = path.leg_phases(state.phase)
         level = frames.heading_from_trunk(frames.up_in_trunk(sensors.orientation))
         hips = self.geometry.hip_position @ level.T
-        time_left = xp.maximum(math.pi - phases, 0.0 * phases) / (2.0 * math.pi * state.frequency)
-        end = (0.5 - EARLY) * self.config.step_length * state.stride
         lag = self.feet(sensors) - hips - xp.reshape(state.targets[0], (4, 3)) @ level.T
-        left = xp.exp(-(time_left + self.dt) / LAG)[:, None] * lag
-        place = hips + self.base_foot + self.residual_displacement(state, sensors) + left
-        return place[:, :2] + end + time_left[:, None] * velocity
+        left = xp.exp(-(self._time_left(state, xp) + self.dt) / LAG)[:, None] * lag
+        moved = self.residual_displacement(state, sensors) + left
+        return self.step_ends(state, sensors, velocity) + moved[:, :2]
+
+    def _time_left(self, state: ControllerState, xp: Any) -> Array:
+        """Time (4,) s until feet in swing come down."""
+        phases = path.leg_phases(state.phase)
+        return xp.maximum(math.pi - phases, 0.0 * phases) / (2.0 * math.pi * state.frequency)
 
     def observe(
         self, state: ControllerState, sensors: Sensors, heights: Array | None, command: Array

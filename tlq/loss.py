@@ -70,7 +70,7 @@ def ppo_loss(
     value_loss = 0.5 * config.value_loss * jnp.mean(jnp.square(targets - values))
     by_env = jax.vmap(lambda p, key: distribution.entropy({"action": p}, key), in_axes=(1, 0), out_axes=1)
     entropy_loss = -config.entropy * jnp.mean(by_env(parameters["action"], keys))
-    guide_loss = _guide_loss(rollout, parameters["action"]) if rollout.guide.shape[-1] else jnp.float32(0)
+    guide_loss = _guide_loss(rollout.guide, parameters["action"]) if rollout.guide.size else jnp.float32(0)
     total = policy_loss + value_loss + entropy_loss + config.guide * guide_loss
 
     new = distribution.create_dist(parameters)
@@ -87,16 +87,18 @@ def ppo_loss(
     }
 
 
-LARGEST = 0.95
-"""Mean action that a guide may lead to; at 1 the action before tanh would be infinite."""
+FAR = 0.1
+"""Distance (m) of a foot from where the guide wants it that costs 1."""
 
 
-def _guide_loss(rollout: Rollout, parameters: jax.Array) -> jax.Array:
-    """Mean square distance (), summed over the angles, of the mean action from what the guide made of the old one.
+def _guide_loss(wish: jax.Array, parameters: jax.Array) -> jax.Array:
+    """Mean square distance (), summed over the feet, from where the guide wants them to where the mean action leads them.
 
-    Only where the guide asks for something. parameters: (T, B, 2 A), of the new policy.
+    Args:
+      wish: (T, B, L, 2, 4), of `envs.guide.guide`.
+      parameters: (T, B, 2 A), of the new policy.
     """
-    mean, old = (jnp.tanh(jnp.split(p, 2, axis=-1)[0]) for p in (parameters, rollout.parameters))
-    wanted = jnp.clip(old + rollout.guide, -LARGEST, LARGEST)
-    asked = jnp.abs(rollout.guide) > 0
-    return jnp.mean(jnp.sum(jnp.where(asked, jnp.square(mean - wanted), 0.0), axis=-1))
+    mean = jnp.tanh(jnp.split(parameters, 2, axis=-1)[0])
+    residual = mean[..., 2:].reshape(*wish.shape[:3], 3)
+    away = jnp.einsum("tblij,tblj->tbli", wish[..., :3], residual) - wish[..., 3]
+    return jnp.mean(jnp.sum(jnp.square(away / FAR), axis=(-2, -1)))

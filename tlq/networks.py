@@ -48,11 +48,11 @@ class NetworkConfig:
     """Width of a recurrent layer."""
     encoder: int = 128
     """Width of the proprioceptive encoder and of the layer that mixes it with the feet."""
-    foot_encoder: tuple[int, int] = (32, 16)
+    foot_encoder: tuple[int, int] = (64, 32)
     """Widths of the encoder of one foot's heights; its weights are shared by the four feet."""
     head: int = 64
     """Width of the layer before the action."""
-    leg_head: int = 32
+    leg_head: int = 64
     """Width of the layer that turns what one foot sees into that leg's residuals, its weights shared by the four legs:
     what one leg learns about an edge, all of them know. 0: none."""
     leg_context: int = 16

@@ -53,7 +53,7 @@ class PPOConfig:
     """Lower bound of the adaptive learning rate."""
     learning_rate_max: float = 1e-3
     """Upper bound of the adaptive learning rate."""
-    kl_target: float = 0.03
+    kl_target: float = 0.015
     """KL(old, new) of an iteration that the learning rate is steered to; 0 keeps the learning rate."""
     entropy: float = 0.0
     """Weight of the entropy bonus."""
@@ -92,7 +92,7 @@ class Rollout:
     reward: jax.Array  # (T, B)
     done: jax.Array  # (T, B)
     truncation: jax.Array  # (T, B)
-    guide: jax.Array  # (T, B, A) change of the action that a guide asks for; (T, B, 0) without one
+    guide: jax.Array  # (T, B, L, 2, 4) what a guide asks for, see envs/guide.py; (T, B, 0) without one
 
 
 def make_mesh(num_devices: int = 0) -> Mesh:
