@@ -3,8 +3,8 @@
     python -m benchmarks.footholds policy=flat difficulty=0.5 reflex=false
     python -m benchmarks.footholds policy=flat difficulty=0.5 reflex=true depth=0.5 json=FILE
 
-The reflex is the guide (envs/guide.py): a foot in swing whose step ends near a gap is led to better ground by inverse
-kinematics, in place of the policy's residual joint angles. It knows the true map.
+The reflex follows the guide (envs/guide.py): a foot in swing whose step ends near a gap is led to better ground by
+inverse kinematics, on top of the policy's residual joint angles, and held there while it stands. It knows the true map.
 
 Episodes as in training, in MJX, on terrains that training never saw: noise and randomisation but no pushes, all walk;
 an episode ends with a foot in a gap, a fall, or at 5 m.
@@ -41,6 +41,8 @@ SETTLED = 3
 """Control steps after which a foot stands."""
 AT_LIMIT = 0.9
 """Residual action from which it counts as being at its limit, 1."""
+LET_GO = 1.0
+"""Phase (rad) of swing up to which a foot that lifts off forgets where it was led."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,21 +77,36 @@ def make_env(policy: Policy, options: Options) -> envs.QuadrupedEnv:
     return envs.make(config)
 
 
-def with_reflex(env: envs.QuadrupedEnv, episode: envs.Episode, action: jax.Array) -> jax.Array:
-    """The policy's action (14,) with the guide's wishes in place of its own where that has any."""
-    wished = guide.guide(env, episode)
-    return jnp.where(jnp.isnan(wished), action, jnp.clip(wished, -1.0, 1.0))
+def lead(env: envs.QuadrupedEnv, episode: envs.Episode, led: jax.Array) -> jax.Array:
+    """Where the reflex leads the feet: displacements (L, 2) m, heading frame, from those of the step before.
+
+    A foot that has landed is held there: let go at once it would push the trunk.
+    """
+    wished, asked = guide.displacements(env, episode)
+    phases = tg.path.leg_phases(episode.controller.phase)[:, None]
+    kept = jnp.where((phases > 0) & (phases < LET_GO), 0.85 * led, led)
+    return jnp.where(asked[:, None], wished, kept)
+
+
+def with_reflex(
+    env: envs.QuadrupedEnv, episode: envs.Episode, action: jax.Array, led: jax.Array
+) -> jax.Array:
+    """The policy's action (14,) with residual joint angles that move the feet by `led` (L, 2) m."""
+    mirror = env.core.update_mirror(episode.controller.mirror, env.heading_command(episode))
+    change = jnp.concatenate([jnp.zeros(2), guide.residuals(env, episode, led).reshape(-1)])
+    return jnp.clip(action + env.core.mirror_action(mirror, change), -1.0, 1.0)
 
 
 def step(
-    policy: Policy, env: envs.QuadrupedEnv, options: Options, carried: tuple[Any, jax.Array]
-) -> tuple[tuple[Any, jax.Array], dict[str, jax.Array]]:
+    policy: Policy, env: envs.QuadrupedEnv, options: Options, carried: tuple[Any, jax.Array, jax.Array]
+) -> tuple[tuple[Any, jax.Array, jax.Array], dict[str, jax.Array]]:
     """One control step of one robot, and what it shows."""
-    state, memory = carried
+    state, memory, led = carried
     episode = state.pipeline_state
     action, memory = policy.graph(state.obs["state"], memory)
     if options.reflex:
-        action = with_reflex(env, episode, action)
+        led = lead(env, episode, led)
+        action = with_reflex(env, episode, action, led)
     state = env.step(state, action)
     before, episode = episode, state.pipeline_state
     _, around = env._terrain_at_feet(episode)
@@ -110,7 +127,7 @@ def step(
         "feet": in_world(episode, env.core.feet(envs.env.exact_sensors(episode))[:, :2]),
         "command": episode.command,
     }
-    return (state, memory), shown
+    return (state, memory, led), shown
 
 
 def in_world(episode: envs.Episode, points: jax.Array) -> jax.Array:
@@ -147,7 +164,7 @@ def measure(options: Options) -> dict[str, float]:
     length = round(options.seconds / env.dt)
     one = jax.vmap(functools.partial(step, policy, env, options))
     state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(1), options.robots))
-    start = (state, jnp.zeros((options.robots, policy.memory_size)))
+    start = (state, jnp.zeros((options.robots, policy.memory_size)), jnp.zeros((options.robots, 4, 2)))
     run = jax.jit(lambda carried: jax.lax.scan(lambda c, _: one(c), carried, length=length)[1])
     shown = {name: np.asarray(x) for name, x in run(start).items()}
     ended = np.where(shown["done"].any(axis=0), shown["done"].argmax(axis=0), length - 1)

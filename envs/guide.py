@@ -1,9 +1,10 @@
 """Where feet in swing had better go: joint angles that training can imitate. It learns nothing itself.
 
 For each foot in swing, the true ground round the end of its step is searched for the place where a foot that lands with
-some error hits no gap; the guide says which residual joint angles lead there, all the way, and from early in the swing on.
+some error hits no gap; the guide says which residual joint angles lead there, all the way, from early in the swing on.
 The policy-gradient finds out only by trial which of twelve joint angles would have saved a footstep; this tells it
-(`ppo.guide` is the weight).
+(`ppo.guide` is the weight). An earlier guide asked for a share of the way as a change of the policy's own action: that
+has no fixed point but the ends of the action's range (docs/experiments.md).
 """
 
 from typing import cast
@@ -26,8 +27,8 @@ ERROR = 0.025
 NEAR = 2
 """Cells to each side of a place that count."""
 FARTHER, ANOTHER = 2.0, 0.5
-"""What a metre costs from where balance wants the foot, and one from where it is led already; a place that is nothing but
-gap costs 1."""
+"""What a metre costs from where balance wants the foot, and one from where it is led already; a place that is nothing
+but gap costs 1."""
 BALANCE = 0.15
 """Seconds of the trunk's excess speed that a foot is placed farther along, as a walking inverted pendulum asks for."""
 AWAY = 0.1
@@ -37,7 +38,7 @@ SAFE = 0.02
 LIFTING = 0.3
 """Phase (rad) of swing up to which a foot isn't sent anywhere."""
 ARRIVED = 1.5
-"""Phase (rad) from which it is led all the way to its place; a share of it before, as joints that jump upset the trunk."""
+"""Phase (rad) from which it is led all the way to its place; a share of it before: joints that jump upset the trunk."""
 LEGS_IN_SWING = 2
 """At most, in a trot: more than these aren't looked at."""
 
@@ -98,7 +99,9 @@ def residuals(env: QuadrupedEnv, episode: Episode, displacement: jax.Array) -> j
     target, level = _target(env, episode)
     moved = target + jnp.pad(displacement, ((0, 0), (0, 1))) @ level
     geometry = env.core.geometry
-    return (tg.leg.inverse(geometry, moved) - tg.leg.inverse(geometry, target)) / env.core.config.residual_range
+    return (
+        tg.leg.inverse(geometry, moved) - tg.leg.inverse(geometry, target)
+    ) / env.core.config.residual_range
 
 
 def _target(env: QuadrupedEnv, episode: Episode) -> tuple[jax.Array, jax.Array]:
@@ -113,8 +116,8 @@ def _target(env: QuadrupedEnv, episode: Episode) -> tuple[jax.Array, jax.Array]:
 def guide(env: QuadrupedEnv, episode: Episode) -> jax.Array:
     """The guide's wish for the next action: (L, 2, 4), zero where it has none.
 
-    Of leg l, [:, :3] is how far (m) its residual actions move the foot, forwards and left, and [:, 3] how far they should.
-    The leg's height is left to the policy. Legs and sides are the policy's, mirrored if its observation is.
+    Of leg l, [:, :3] is how far (m) its residual actions move the foot, forwards and left, and [:, 3] how far they
+    should. The leg's height is left to the policy. Legs and sides are the policy's, mirrored if its observation is.
     """
     led, asked = displacements(env, episode)
     target, level = _target(env, episode)

@@ -45,5 +45,5 @@ class TGConfig:
     mirror_hysteresis: float = 0.15
     """The mirror flips when the command's lateral part passes this far to the other side."""
     look_ahead: bool = True
-    """Sample the terrain round the place where a foot in swing will come down; false: round the foot, as the paper
+    """Sample the terrain round the place where a foot in swing ends its step; false: round the foot, as the paper
     does, so that the policy sees a foothold only when the foot is nearly there."""

@@ -205,8 +205,8 @@ class Core:
     def step_ends(self, state: ControllerState, sensors: Sensors, velocity: Array) -> Array:
         """Where the trajectory generator leads feet in swing: (4, 2) m from the trunk's centre, heading frame.
 
-        The end of the step less EARLY, and the trunk's way until then at its velocity (2,) m/s. Residual joint angles are
-        left out, so that a foothold seen from there stays where it is while they lead the foot to it.
+        The end of the step less EARLY, and the trunk's way until then at its velocity (2,) m/s. Residual joint angles
+        are left out, so that a foothold seen from there stays where it is while they lead the foot to it.
         """
         xp = state.targets.__array_namespace__()
         level = frames.heading_from_trunk(frames.up_in_trunk(sensors.orientation))
@@ -217,8 +217,8 @@ class Core:
     def landing_points(self, state: ControllerState, sensors: Sensors, velocity: Array) -> Array:
         """Where feet in swing will come down: (4, 2) m from the trunk's centre, heading frame.
 
-        `step_ends`, the displacement by the residual joint angles, which are taken to stay as they are, and what will be
-        left of the joints' lag.
+        `step_ends`, the displacement by the residual joint angles, which are taken to stay as they are, and what will
+        be left of the joints' lag.
         """
         xp = state.targets.__array_namespace__()
         level = frames.heading_from_trunk(frames.up_in_trunk(sensors.orientation))

@@ -92,7 +92,7 @@ FAR = 0.1
 
 
 def _guide_loss(wish: jax.Array, parameters: jax.Array) -> jax.Array:
-    """Mean square distance (), summed over the feet, from where the guide wants them to where the mean action leads them.
+    """Mean square distance (), summed over the feet, from where the guide wants them to where the mean action leads.
 
     Args:
       wish: (T, B, L, 2, 4), of `envs.guide.guide`.

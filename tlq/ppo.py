@@ -172,6 +172,21 @@ class Learner:
         """One iteration: the next state, and the figures () of this one."""
         return self._jitted(self._step_constants, state)
 
+    def batch(self, state: TrainState) -> dict[str, jax.Array]:
+        """What `step` would learn from: each part of the rollout by name (T, B, ...), `carry` and `last` (B, ...)."""
+
+        def roll(constants: list[jax.Array], state: TrainState):
+            _, key, _ = jax.random.split(state.key, 3)
+            env_state, rollout, _ = self._rollout(constants, state, key)
+            return rollout, state.env_state.obs["carry"], env_state.obs["privileged_state"]
+
+        specs = (P(), self.specs), (P(None, AXIS), P(AXIS), P(AXIS))
+        shared = jax.shard_map(roll, mesh=self.mesh, in_specs=specs[0], out_specs=specs[1], check_vma=False)
+        rollout, carry, last = jax.jit(shared)(self._step_constants, state)
+        parts = {f.name: getattr(rollout, f.name) for f in dataclasses.fields(rollout)}
+        observation = parts.pop("observation")
+        return parts | observation | {"carry": carry, "last": last}
+
     # -- state ---------------------------------------------------------------------------------------------------------
 
     def init(self, seed: int) -> TrainState:

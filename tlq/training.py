@@ -23,6 +23,7 @@ from tlq import memory
 from tlq.checkpoint import Checkpoints, names, read_arrays
 from tlq.config import TrainConfig, load_config, save_config, training_env
 from tlq.export import commit
+from tlq.files import whole
 from tlq.logger import Logger
 from tlq.networks import make_networks
 from tlq.ppo import Learner, TrainState, make_mesh
@@ -108,7 +109,7 @@ def _loop(
             measured = {k: float(v) for k, v in jax.device_get(metrics).items()}
             iteration += 1
             if not measured.pop("finite"):
-                raise TrainingFailed(save_failed(config, before, iteration))
+                raise TrainingFailed(save_failed(config, learner, before, iteration))
             figures = {
                 "iteration": float(iteration),
                 "env_steps": float(iteration * learner.steps_per_iteration),
@@ -166,16 +167,32 @@ def export(config: TrainConfig, state: TrainState, env_steps: int) -> None:
     export_policy(path, config, state.params.policy, state.normaliser, {"env_steps": env_steps})
 
 
-def save_failed(config: TrainConfig, before: TrainState, iteration: int) -> str:
-    """Saves the whole state before a failed update, from which one `Learner.step` fails again; returns the message."""
+def save_failed(config: TrainConfig, learner: Learner, before: TrainState, iteration: int) -> str:
+    """Saves the whole state before a failed update, from which one `Learner.step` fails again, and the batch it read.
+
+    Returns the message. The batch is `batch-<process>.npz`, with this process's environments.
+    """
     place = Path(config.run) / "failed"
     failed = Checkpoints(place)
     failed.save(iteration - 1, before, {"seed": config.seed, "iteration": iteration, "commit": commit()})
     failed.close()
+    with whole(place / f"batch-{config.process}.npz") as temporary:
+        parts: dict[str, Any] = {name: _own(name, x) for name, x in learner.batch(before).items()}
+        np.savez_compressed(temporary, **parts)
     leaves = zip(names(before.env_state), jax.tree.leaves(before.env_state), strict=True)
     bad = [n for n, x in leaves if np.issubdtype(x.dtype, np.floating) and not bool(jnp.isfinite(x).all())]
     why = f"; not finite before it: {', '.join(bad[:4])}" if bad else ""
-    return f"update {iteration} (seed {config.seed}) isn't finite; the state before it is in {place}{why}"
+    saved = f"the state before it and its batch are in {place}"
+    return f"update {iteration} (seed {config.seed}) isn't finite; {saved}{why}"
+
+
+def _own(name: str, x: jax.Array) -> np.ndarray:
+    """The part of a batch that lies on this process's devices."""
+    if x.is_fully_addressable:
+        return np.asarray(x)
+    axis = 0 if name in ("carry", "last") else 1
+    shards = sorted(x.addressable_shards, key=lambda shard: shard.index[axis].start)
+    return np.concatenate([np.asarray(shard.data) for shard in shards], axis)
 
 
 def initialise(state: TrainState, source: str, config: TrainConfig | None = None) -> TrainState:

@@ -9,86 +9,124 @@ import envs
 import terrains
 import tg
 from envs import guide
+from envs.env import exact_sensors
 from tests.envs.subjects import cell_centres, change_episode, standing
 
 LEFT, RIGHT = np.array([0.0, 1.0]), np.array([0.0, -1.0])
 
 
-def walking(subject, k, xy, command):
-    """A robot in mid-step on terrain k."""
+def walking(subject, k, xy, command, phase=np.pi / 2, mirror=1.0):
+    """A robot in a step on terrain k, its feet led a little aside."""
     qpos = standing(subject.env, xy=xy, yaw=0.4)
     episode = subject.begin(jax.random.key(3), jnp.int32(9))
+    controller = episode.controller
+    random = np.random.default_rng(round(1000 * abs(phase)))
+    controller = controller._replace(
+        phase=jnp.float32(phase),
+        gate=jnp.float32(1.0),
+        stride=jnp.asarray(tg.frames.turn(np.array(-0.4), command), jnp.float32),
+        mirror=jnp.float32(mirror),
+        targets=controller.targets + jnp.asarray(random.normal(scale=0.03, size=(2, 12)), jnp.float32),
+    )
+    episode = episode.replace(controller=controller)
     return change_episode(episode, qpos=qpos, terrain=k, command=command, floor=-0.5)
 
 
 @pytest.mark.parametrize("command", [LEFT, RIGHT])
-def test_feet_are_sent_to_the_best_ground_near(exact, command):
-    env, k = exact.env, exact.find("poles", 9)
-    terrain, threshold = exact.terrain(k), exact.config.rewards.gap_threshold
-    ways = jax.jit(lambda episode: guide.ways(env, episode))
-    sent = 0
-    for xy in np.random.default_rng(0).uniform(-1.2, 1.2, (20, 2)):
-        episode = walking(exact, k, xy, command)
-        found = np.asarray(ways(episode))
-        swing = tg.path.leg_phases(np.asarray(episode.controller.phase)) > guide.LIFTING
-        np.testing.assert_array_equal(found[~swing], 0)
-        landing, moved = (
-            np.asarray(env.landing_points(episode)),
-            np.asarray(env.core.residual_displacement(episode.controller, envs.env.exact_sensors(episode))),
-        )
-        for leg in np.flatnonzero(swing):
-
-            def height(way, landing=landing[leg], xy=xy):
-                at = np.asarray(xy) + tg.frames.turn(np.array(0.4), landing + way)
-                return float(terrains.exact_height(terrain, cell_centres(env.bank, at)))
-
-            cells = [guide.CELL * np.array([i, j]) for i in range(-6, 7) for j in range(-6, 7)]
-            heights = [height(way) for way in cells]
-            low = {
-                (round(w[0], 3), round(w[1], 3)): max(heights) - h > threshold
-                for w, h in zip(cells, heights, strict=True)
-            }
-            costs = []
+def test_feet_are_led_to_the_best_ground_near(exact, command):
+    env, k, random = exact.env, exact.find("poles", 9), np.random.default_rng(0)
+    terrain, c = exact.terrain(k), env.config
+    displacements = jax.jit(lambda episode: guide.displacements(env, episode))
+    n, near = guide.REACH + guide.NEAR, range(-guide.NEAR, guide.NEAR + 1)
+    led = 0
+    for xy in random.uniform(-1.2, 1.2, (20, 2)):
+        episode = walking(exact, k, xy, command, phase=random.uniform(0.0, np.pi))
+        found, asked = map(np.asarray, displacements(episode))
+        phases = tg.path.leg_phases(np.asarray(episode.controller.phase))
+        assert not asked[phases <= guide.LIFTING].any()
+        speed = 2 * episode.controller.frequency * c.tg.step_length
+        excess = env.velocity(episode) - speed * episode.controller.stride
+        balance = np.clip(guide.BALANCE * np.asarray(excess), -guide.AWAY, guide.AWAY)
+        residual = env.core.residual_displacement(episode.controller, envs.env.exact_sensors(episode))
+        for leg in np.flatnonzero(phases > guide.LIFTING):
+            end = np.asarray(env.step_ends(episode))[leg]
+            heights = {}
+            for i in range(-n, n + 1):
+                for j in range(-n, n + 1):
+                    way = end + guide.CELL * np.array([i, j])
+                    at = np.asarray(xy) + tg.frames.turn(np.array(0.4), way)
+                    heights[i, j] = float(terrains.exact_height(terrain, cell_centres(env.bank, at)))
+            top = max(heights.values())
+            share = min((phases[leg] - guide.LIFTING) / (guide.ARRIVED - guide.LIFTING), 1.0)
+            share = 3 * share**2 - 2 * share**3
+            now = np.clip(np.asarray(residual)[leg, :2] / max(share, 0.3), -0.125, 0.125)
+            costs, gaps, away = [], [], []
             for way in guide.places():
-                near = [
-                    low[round(way[0] + dx, 3), round(way[1] + dy, 3)]
-                    for dx in (-0.02, 0, 0.02)
-                    for dy in (-0.02, 0, 0.02)
-                ]
-                there = moved[leg, :2] + way
-                beyond = max(np.abs(there).max() - guide.LIMIT, 0)
-                costs.append(np.mean(near) + np.linalg.norm(way) + 0.3 * np.linalg.norm(there) + 10 * beyond)
-            if not any(low.values()):
-                np.testing.assert_array_equal(found[leg], 0)
-                continue
-            chosen = int(np.argmin(np.linalg.norm(guide.places() - found[leg], axis=1)))
-            assert costs[chosen] == pytest.approx(min(costs), abs=1e-4)
-            sent += np.linalg.norm(found[leg]) > 0
-    assert sent > 5
+                i, j = np.round(way / guide.CELL).astype(int)
+                weight = {
+                    (a, b): np.exp(-0.5 * (a * a + b * b) * (guide.CELL / guide.ERROR) ** 2)
+                    for a in near
+                    for b in near
+                }
+                low = sum(
+                    w for (a, b), w in weight.items() if top - heights[i + a, j + b] > c.rewards.gap_threshold
+                )
+                gaps.append(low / sum(weight.values()))
+                away.append(np.linalg.norm(now - way))
+                costs.append(
+                    gaps[-1] + guide.FARTHER * np.linalg.norm(balance - way) + guide.ANOTHER * away[-1]
+                )
+            danger = max(gaps[len(gaps) // 2], gaps[int(np.argmin(away))])
+            if abs(danger - guide.SAFE) > 1e-4:
+                assert asked[leg] == (danger > guide.SAFE)
+            chosen = int(np.argmin(np.linalg.norm(share * guide.places() - found[leg], axis=1)))
+            np.testing.assert_allclose(share * guide.places()[chosen], found[leg], atol=1e-5)
+            assert costs[chosen] == pytest.approx(min(costs), abs=1e-3)
+            led += asked[leg] and np.linalg.norm(found[leg]) > 0
+    assert led > 5
 
 
 @pytest.mark.parametrize("command", [LEFT, RIGHT])
-def test_the_action_moves_the_feet_that_way(exact, command):
-    """Own residuals after undoing the mirror, through the leg's kinematics."""
-    env, k = exact.env, exact.find("poles", 9)
+@pytest.mark.parametrize("mirror", [1.0, -1.0])
+def test_the_wish_is_about_the_policys_own_actions(exact, command, mirror):
+    """Residuals that lead MuJoCo's feet there fulfil it, mirrored if the policy is; stance legs are free."""
+    env, k, random = exact.env, exact.find("poles", 9), np.random.default_rng(1)
     core = env.core
-    both = jax.jit(lambda episode: (guide.guide(env, episode), guide.ways(env, episode)))
+
+    @jax.jit
+    def all_of_it(episode):
+        led, wanted = guide.displacements(env, episode)
+        return guide.guide(env, episode), led, wanted, guide.residuals(env, episode, led)
+
     asked = 0
-    for xy in np.random.default_rng(1).uniform(-1.2, 1.2, (8, 2)):
-        episode = walking(exact, k, xy, command)
-        action, ways = both(episode)
-        np.testing.assert_array_equal(action[:2], 0)
-        mirror = core.update_mirror(episode.controller.mirror, env.heading_command(episode))
-        residual = np.asarray(core.mirror_action(mirror, action)[2:]).reshape(4, 3)
-        target = episode.controller.targets[0].reshape(4, 3)
-        angles = tg.leg.inverse(core.geometry, target) + core.config.residual_range * residual
-        moved = np.asarray(
-            tg.leg.forward(core.geometry, angles) - target
-        )  # level: trunk's is the heading frame
-        wanted = guide.GAIN * np.asarray(ways)
-        np.testing.assert_allclose(moved[:, :2], wanted, atol=1e-4)
-        np.testing.assert_allclose(moved[:, 2], 0, atol=1e-4)
-        asked += np.abs(wanted).max() > 0
+    for xy in random.uniform(-1.2, 1.2, (6, 2)):
+        episode = walking(exact, k, xy, command, phase=random.uniform(0.0, np.pi), mirror=mirror)
+        wish, led, wanted, own = map(np.asarray, all_of_it(episode))
+        mirrored = core.update_mirror(episode.controller.mirror, env.heading_command(episode))
+        action = np.asarray(core.mirror_action(mirrored, np.concatenate([np.zeros(2), own.ravel()])))
+        away = np.einsum("lij,lj->li", wish[..., :3], action[2:].reshape(4, 3)) - wish[..., 3]
+        order = [0, 1, 2, 3] if mirrored > 0 else [1, 0, 3, 2]
+        np.testing.assert_allclose(away[wanted[order]], 0, atol=0.01)
+        np.testing.assert_array_equal(np.abs(wish).sum(axis=(1, 2)) > 0, wanted[order])
+        residual = core.config.residual_range * own
+        phases = tg.path.leg_phases(
+            tg.path.advance(np.asarray(episode.controller.phase), np.float32(1.6), 0.02)
+        )
+        target = core.foot_targets(
+            phases,
+            np.asarray(episode.controller.lift),
+            np.asarray(episode.controller.stride),
+            exact_sensors(episode),
+        )
+        angles = np.asarray(tg.leg.inverse(core.geometry, target))
+        feet = []
+        for q in (angles, angles + residual):
+            qpos = np.array(episode.qpos)
+            qpos[7:] = q.ravel()
+            feet.append(exact.kinematics(qpos).site_xpos[env.robot.foot_site_ids, :2].copy())
+        moved = tg.frames.turn(-tg.frames.yaw(np.asarray(episode.qpos[3:7])), feet[1] - feet[0])
+        np.testing.assert_allclose(moved, led, atol=1e-4)
+        asked += wanted.sum()
     assert asked > 2
 
 

@@ -213,15 +213,15 @@ def test_points_lie_on_circles(subject):
     np.testing.assert_allclose(np.sort(distance, axis=1), np.tile(radii, (4, 1)), atol=1e-7)
 
 
-def test_heights_are_wanted_where_feet_in_swing_land(subject):
+def test_heights_are_wanted_where_steps_end(subject):
     """Of feet in stance, of a robot that stands, and without look-ahead: round the feet."""
     core, sensors = subject.core, random_sensors(subject.core, 3)
     feet, state = core.feet(sensors)[:, :2], walk(core, 20)[-1][0]
     swing = tg.path.leg_phases(state.phase) > 0
     assert swing.sum() == 2 and state.gate == 1
-    landing = core.landing_points(state, sensors, core.odometry(state, sensors))
-    expected = np.where(swing[:, None], landing, feet)
-    assert np.abs(landing - feet)[swing].max() > 0.02
+    ends = core.step_ends(state, sensors, core.odometry(state, sensors))
+    expected = np.where(swing[:, None], ends, feet)
+    assert np.abs(ends - feet)[swing].max() > 0.02
     np.testing.assert_allclose(core.sample_points(state, sensors), core.around(expected))
     np.testing.assert_allclose(core.centres(state._replace(gate=0.0 * state.gate), sensors), feet)
     behind = dataclasses.replace(core, config=dataclasses.replace(core.config, look_ahead=False))
@@ -241,6 +241,10 @@ def test_feet_land_where_the_generator_leads_them(subject):
     early = tg.core.EARLY * core.config.step_length * state.stride
     expected = (core.geometry.hip_position + ends + moved)[:, :2] - early
     np.testing.assert_allclose(found, expected, atol=1e-6)
+    # Residuals lead the feet away from there, but not the place where heights are wanted.
+    ends = core.step_ends(state, sensors, np.zeros(2))
+    np.testing.assert_allclose(ends, expected - moved[:, :2], atol=1e-6)
+    assert np.abs(moved).max() > 0.01
     ahead = core.landing_points(state, sensors, np.array([0.5, 0.0])) - found
     left = np.maximum(np.pi - tg.path.leg_phases(state.phase), 0) / (2 * np.pi * state.frequency)
     np.testing.assert_allclose(ahead, 0.5 * left[:, None] * [1, 0], atol=1e-6)

@@ -163,11 +163,15 @@ def test_a_task_that_needs_the_memory(memory, solves):
     assert (reward > 0.6) == solves, reward
 
 
+LEG = 3 * jnp.ones((2, 3)).at[0, 1].set(-1.0).at[1, 2].set(0.0)
+
+
 class Asking(Wrapper):
-    """Asks for more of the first action, whatever the state."""
+    """Asks that two legs' actions lead the feet somewhere, whatever the state."""
 
     def _ask(self, state):
-        return state.replace(info=state.info | {"guide": jnp.zeros(ACTIONS).at[0].set(0.2)})
+        wish = jnp.zeros((4, 2, 4)).at[1, :, :3].set(0.1 * LEG).at[1, :, 3].set(jnp.array([0.05, -0.03]))
+        return state.replace(info=state.info | {"guide": wish})
 
     def reset(self, key):
         return self._ask(self.env.reset(key))
@@ -176,20 +180,22 @@ class Asking(Wrapper):
         return self._ask(self.env.step(state, action))
 
 
-def test_a_policy_does_what_its_guide_asks_for():
-    config = dataclasses.replace(CONFIG, guide=30.0, learning_rate=1e-3, epochs=4)
+def test_a_policy_leads_feet_where_its_guide_asks_for():
+    config = dataclasses.replace(CONFIG, guide=30.0, learning_rate=3e-3, epochs=4)
     learner = make_learner(config=config, env=Asking(ToyEnv(length=5)))
     state = learner.init(0)
-    means = []
-    for _ in range(8):
+    losses = []
+    for _ in range(12):
         state, metrics = learner.step(state)
-        parameters = learner.networks.policy_network.apply(
-            state.normaliser, state.params.policy, state.env_state.obs
-        )
-        means.append(float(jnp.mean(jnp.tanh(parameters["action"][:, 0]))))
-    assert means[-1] > means[0] + 0.1
-    # What it asks for is a change of the old mean: an unchanged policy is off by just that.
-    assert 0 < float(metrics["loss/guide"]) < 0.05
+        losses.append(float(metrics["loss/guide"]))
+    parameters = learner.networks.policy_network.apply(
+        state.normaliser, state.params.policy, state.env_state.obs
+    )
+    residual = np.tanh(parameters["action"][:, :14])[:, 2:].reshape(-1, 4, 3)
+    np.testing.assert_allclose(0.1 * np.asarray(LEG) @ residual[:, 1].mean(axis=0), [0.05, -0.03], atol=0.02)
+    # Nothing led anywhere at first: the squares of the ways, in units of FAR.
+    assert losses[0] == pytest.approx(0.5**2 + 0.3**2, rel=0.1)
+    assert losses[-1] < 0.1 * losses[0]
 
 
 def test_constants_become_arguments():

@@ -146,12 +146,21 @@ def test_a_failed_update_leaves_the_state_before_it(run, learner, tmp_path, monk
 
     monkeypatch.setattr(learner, "step", poisoned)
     with pytest.raises(
-        TrainingFailed, match=f"update 3 .seed 0. isn't finite; the state before it is in {tmp_path}"
+        TrainingFailed,
+        match=f"update 3 .seed 0. isn't finite; the state before it and its batch are in {tmp_path}",
     ):
         run(5)
     saved = read_arrays(tmp_path / "run/failed")
     assert saved["iteration"] == 2
     assert all(np.isfinite(x).all() for n, x in saved.items() if n.startswith("params"))
+    with np.load(tmp_path / "run/failed/batch-0.npz") as batch:
+        shapes = {name: x.shape for name, x in batch.items()}
+        # The next update's, from the state that was saved.
+        np.testing.assert_array_equal(batch["carry"], saved["env_state.obs.carry"])
+        np.testing.assert_array_equal(batch["state"][0], saved["env_state.obs.state"])
+    unroll, envs = learner.config.unroll, learner.num_envs
+    assert shapes["reward"] == shapes["done"] == shapes["log_prob"] == (unroll, envs)
+    assert shapes["action"] == (unroll, envs, 14) and shapes["last"][0] == envs
 
 
 def test_folders_are_never_overwritten(run, tmp_path):
