@@ -26,11 +26,15 @@ ERROR = 0.025
 """Standard deviation (m) of a landing foot from its place, by which the gaps near a place count."""
 NEAR = 2
 """Cells to each side of a place that count."""
-FARTHER, ANOTHER = 2.0, 0.5
+FARTHER, ANOTHER = 1.0, 2.0
 """What a metre costs from where balance wants the foot, and one from where it is led already; a place that is nothing
 but gap costs 1."""
 BALANCE = 0.15
 """Seconds of the trunk's excess speed that a foot is placed farther along, as a walking inverted pendulum asks for."""
+ACROSS = 6.0
+"""What a metre costs by which the line between two feet in swing is moved across itself, from where balance wants it."""
+CANDIDATES = 16
+"""Places of each foot, the best ones alone, of which the best pair is taken."""
 AWAY = 0.1
 """Largest displacement (m) for balance."""
 SAFE = 0.02
@@ -85,13 +89,33 @@ def displacements(env: QuadrupedEnv, episode: Episode) -> tuple[jax.Array, jax.A
     ahead = jnp.clip(BALANCE * (env.velocity(episode) - speed * controller.stride), -AWAY, AWAY)
     far = jnp.linalg.norm(ahead - places(), axis=-1)
     cost = gaps + FARTHER * far + ANOTHER * away
-    best = jnp.asarray(places(), jnp.float32)[jnp.argmin(cost, axis=1)]
+    best = _best_pair(cost, ahead, ends[0] - ends[1])
     here = jnp.take_along_axis(gaps, jnp.argmin(away, axis=1)[:, None], axis=1)[:, 0]
     danger = jnp.maximum(here, gaps[:, len(places()) // 2]) > SAFE
     walking = jnp.sum(jnp.square(episode.command)) > 0.5
     asked = danger & (phases[legs] > LIFTING) & walking
     led = jnp.zeros((4, 2)).at[legs].set(share * best)
     return led, jnp.zeros(4, bool).at[legs].set(asked)
+
+
+def _best_pair(cost: jax.Array, ahead: jax.Array, line: jax.Array) -> jax.Array:
+    """The places (2, 2) m of the two feet that cost least together.
+
+    On two feet a robot topples across the line between them, not along it: what counts is how far the middle of that line
+    is moved across, from where balance wants it.
+
+    Args:
+      cost: (2, N) of each place for each foot alone.
+      ahead: (2,) m, the displacement that balance wants.
+      line: (2,) m, between the ends of the two steps.
+    """
+    least, which = jax.lax.top_k(-cost, CANDIDATES)
+    at = jnp.asarray(places(), jnp.float32)[which]
+    across = jnp.stack([-line[1], line[0]]) / jnp.maximum(jnp.linalg.norm(line), 0.1)
+    off = (at - ahead) @ across
+    together = -least[0][:, None] - least[1] + ACROSS * jnp.abs(off[0][:, None] + off[1]) / 2
+    first, second = jnp.unravel_index(jnp.argmin(together), together.shape)
+    return jnp.stack([at[0, first], at[1, second]])
 
 
 def residuals(env: QuadrupedEnv, episode: Episode, displacement: jax.Array) -> jax.Array:

@@ -2,7 +2,7 @@
 
 import dataclasses
 
-BEFORE = {"look_ahead": False}
+BEFORE = {"look_ahead": False, "retraction": 0.0}
 """Settings of policies from before there was such a setting."""
 
 
@@ -14,12 +14,15 @@ class TGConfig:
     training (docs/experiments.md).
     """
 
-    base_frequency: float = 1.6
+    base_frequency: float = 2.0
     """f_base, gait cycles per second at action 0 (Hz)."""
     frequency_range: float = 0.5
     """δf at action ±1 (Hz)."""
-    step_length: float = 0.2
+    step_length: float = 0.16
     """L, the stride from lift-off to touch-down (m). 0 leaves only the vertical motion (the fixed-height baseline)."""
+    retraction: float = 1.0
+    """Share of swing-leg retraction: 1 lets feet come down and lift off with the ground's speed, 0 with the trunk's, as in
+    the paper."""
     lift: float = 0.08
     """H, the predefined foot height (m)."""
     lift_range: float = 0.06

@@ -24,8 +24,6 @@ HEIGHT_CLIP = 0.25
 """Heights below the foot are cut to ± this (m): deeper than that, a hole is a hole."""
 TURN_CLIP = 0.5
 """The turn since the start is shown up to ± this (rad), so that a robot turned round by hand sees nothing new."""
-EARLY = 0.06
-"""Share of the step that feet come down before its end: measured (docs/experiments.md)."""
 LAG = 0.07
 """Time constant (s) with which joints catch up with what is asked of them: from the same."""
 SMOOTHING = 0.3
@@ -205,12 +203,12 @@ class Core:
     def step_ends(self, state: ControllerState, sensors: Sensors, velocity: Array) -> Array:
         """Where the trajectory generator leads feet in swing: (4, 2) m from the trunk's centre, heading frame.
 
-        The end of the step less EARLY, and the trunk's way until then at its velocity (2,) m/s. Residual joint angles
+        The end of the step, and the trunk's way until then at its velocity (2,) m/s. Residual joint angles
         are left out, so that a foothold seen from there stays where it is while they lead the foot to it.
         """
         xp = state.targets.__array_namespace__()
         level = frames.heading_from_trunk(frames.up_in_trunk(sensors.orientation))
-        end = (0.5 - EARLY) * self.config.step_length * state.stride
+        end = 0.5 * self.config.step_length * state.stride
         place = (self.geometry.hip_position @ level.T + self.base_foot)[:, :2]
         return place + end + self._time_left(state, xp)[:, None] * velocity
 
@@ -342,7 +340,7 @@ class Core:
           (4, 3) m from the abduction joints, trunk frame.
         """
         xp = phases.__array_namespace__()
-        along = path.stride(phases)[:, None] * (self.config.step_length * stride)
+        along = path.stride(phases, self.config.retraction)[:, None] * (self.config.step_length * stride)
         motion = xp.concatenate([along, (lift * path.height(phases))[:, None]], axis=-1)
         if level is None:
             level = frames.heading_from_trunk(frames.up_in_trunk(sensors.orientation))

@@ -40,13 +40,21 @@ def leg_phases(phase: Array) -> Array:
     return wrap(stack([phase + offset for offset in TROT]))
 
 
-def stride(phase: Array) -> Array:
-    """d_l in [-½, ½]: position of a foot along its step, S(|p/π|) - ½.
+def stride(phase: Array, retraction: float = 0.0) -> Array:
+    """d_l: position of a foot along its step, from -½ (lift-off) to ½ (touch-down) in swing and back in stance.
 
-    Swing (p from 0 to π) runs from -½ to +½, forward; stance runs back and propels. Mean stance speed is 2 f L.
+    The paper's is S(|p/π|) - ½. It stops the foot under the trunk at touch-down, so that it comes down with the trunk's
+    speed and slides, and moves in stance at any speed but the trunk's. With a retraction of 1 a foot in stance moves
+    evenly and in swing has the ground's speed at both ends. Mean stance speed is 2 f L.
+
+    Args:
+      phase: (...) rad.
+      retraction: share r of that: S(u) - ½ ± r (S(u) - u) with u = |p/π|, + in swing, - in stance.
     """
     xp = phase.__array_namespace__()
-    return smoothstep(xp.abs(phase) / math.pi) - 0.5
+    u = xp.abs(phase) / math.pi
+    s = smoothstep(u)
+    return s - 0.5 + retraction * xp.sign(phase) * (s - u)
 
 
 def height(phase: Array) -> Array:
