@@ -1,7 +1,8 @@
 """Where feet in swing had better go: joint angles that training can imitate. It learns nothing itself.
 
-For each foot in swing, the true ground round the end of its step is searched for the place where a foot that lands with
-some error hits no gap; the guide says which residual joint angles lead there, all the way, from early in the swing on.
+For the feet in swing, the true ground round the ends of their steps is searched for places where a foot that lands with
+some error hits no gap, and between which the robot keeps its balance; the guide says which residual joint angles lead
+there, all the way, from early in the swing on.
 The policy-gradient finds out only by trial which of twelve joint angles would have saved a footstep; this tells it
 (`ppo.guide` is the weight). An earlier guide asked for a share of the way as a change of the policy's own action: that
 has no fixed point but the ends of the action's range (docs/experiments.md).
@@ -32,7 +33,7 @@ but gap costs 1."""
 BALANCE = 0.15
 """Seconds of the trunk's excess speed that a foot is placed farther along, as a walking inverted pendulum asks for."""
 ACROSS = 6.0
-"""What a metre costs by which the line between two feet in swing is moved across itself, from where balance wants it."""
+"""What a metre costs by which the line between two feet in swing is moved across, from where balance wants it."""
 CANDIDATES = 16
 """Places of each foot, the best ones alone, of which the best pair is taken."""
 AWAY = 0.1
@@ -101,8 +102,8 @@ def displacements(env: QuadrupedEnv, episode: Episode) -> tuple[jax.Array, jax.A
 def _best_pair(cost: jax.Array, ahead: jax.Array, line: jax.Array) -> jax.Array:
     """The places (2, 2) m of the two feet that cost least together.
 
-    On two feet a robot topples across the line between them, not along it: what counts is how far the middle of that line
-    is moved across, from where balance wants it.
+    On two feet a robot topples across the line between them, not along it: what counts is how far the middle of that
+    line is moved across, from where balance wants it.
 
     Args:
       cost: (2, N) of each place for each foot alone.

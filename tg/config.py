@@ -21,8 +21,8 @@ class TGConfig:
     step_length: float = 0.16
     """L, the stride from lift-off to touch-down (m). 0 leaves only the vertical motion (the fixed-height baseline)."""
     retraction: float = 1.0
-    """Share of swing-leg retraction: 1 lets feet come down and lift off with the ground's speed, 0 with the trunk's, as in
-    the paper."""
+    """Share of swing-leg retraction: 1 lets feet come down and lift off with the ground's speed, 0 with the trunk's, as
+    in the paper."""
     lift: float = 0.08
     """H, the predefined foot height (m)."""
     lift_range: float = 0.06

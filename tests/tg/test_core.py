@@ -110,14 +110,14 @@ def test_feet_follow_the_path_in_the_horizontal_frame(subject, tilt):
     sensors = level_sensors(core)._replace(orientation=quaternion)
     lift, length = np.full(4, 0.08), core.config.step_length
     level = tg.frames.heading_from_trunk(tg.frames.up_in_trunk(quaternion))
-    for phase, rise, along in [
-        (np.pi / 2, 0.08, 0.0),
-        (np.pi / 4, 0.04, -0.34375),  # S(1/4) - ½ = 3/16 - 2/64 - ½
-        (3 * np.pi / 4, 0.04, 0.34375),
+    for phase, rise, along, back in [
+        (np.pi / 2, 0.08, 0.0, 0.0),
+        (np.pi / 4, 0.04, -0.4375, 0.25),  # 2 S(1/4) - 1/4 - ½ with S(1/4) = 3/16 - 2/64; in stance 3/4 - ½
+        (3 * np.pi / 4, 0.04, 0.4375, -0.25),
     ]:
         phases = tg.path.leg_phases(np.asarray(phase))
         targets = core.foot_targets(phases, lift, LEFT, sensors) @ level.T - core.base_foot
-        for leg, up, forward in [(0, rise, along), (3, rise, along), (1, 0.0, -along), (2, 0.0, -along)]:
+        for leg, up, forward in [(0, rise, along), (3, rise, along), (1, 0.0, back), (2, 0.0, back)]:
             expected = [*(length * forward * LEFT), up]
             np.testing.assert_allclose(targets[leg], expected, atol=1e-9)
 

@@ -79,10 +79,10 @@ def test_no_vertical_speed_where_the_foot_changes(where):
             assert small / smaller == pytest.approx(4.0, rel=0.02)
 
 
-@pytest.mark.parametrize("function", [path.height, path.stride])
+@pytest.mark.parametrize("function", [path.height, path.stride, lambda p: path.stride(p, 1.0)])
 def test_the_path_is_continuous_over_the_whole_cycle(function):
     cycle = path.wrap(np.linspace(-2 * PI, 2 * PI, 40_001))
-    # Steepest: 1.5 · 2/π per rad for the height; a grid step is 2π/20000 rad.
+    # Steepest: 1.5 · 2/π per rad for the height, 2/π for the stride; a grid step is 2π/20000 rad.
     assert np.abs(np.diff(function(cycle))).max() < 1.01 * 1.5 * 2 / PI * 4 * PI / 40_000
 
 
@@ -102,6 +102,20 @@ def test_stance_runs_backward_at_2fL():
     assert (speed < 1e-9).all()
     assert -(x[-1] - x[0]) / time[-1] == pytest.approx(2 * frequency * length)
     assert -speed.min() == pytest.approx(3 * frequency * length, rel=1e-4)
+
+
+def test_retraction_gives_feet_the_grounds_speed():
+    """Even in stance, and the same speed just before touch-down and just after lift-off; the ends of the step stay."""
+    stance = path.stride(np.linspace(-PI + 1e-9, -1e-9, 101), 1.0)
+    np.testing.assert_allclose(stance, np.linspace(0.5, -0.5, 101), atol=1e-8)
+    small = 1e-5
+    for phase in (0.0, PI - small):  # after lift-off, before touch-down
+        slope = (path.stride(np.array(phase + small), 1.0) - path.stride(np.array(phase), 1.0)) / small
+        assert slope == pytest.approx(-1 / PI, rel=1e-3)
+    np.testing.assert_allclose(path.stride(np.array([0.0, PI / 2, PI, -PI / 2]), 1.0), [-0.5, 0, 0.5, 0])
+    phases = np.linspace(-PI, PI, 50)
+    half = 0.5 * (path.stride(phases) + path.stride(phases, 1.0))
+    np.testing.assert_allclose(path.stride(phases, 0.5), half, atol=1e-12)
 
 
 def test_samples_lie_on_the_circles():
