@@ -92,7 +92,7 @@ class Environments:
         row = sum(here[k].size for k in (*NORMALISED, "is_first")) / self.config.num_envs
         guides = "guide" in self.state.env_state.info
         # Action, its distribution, what the guide asks for; log-probability, reward, done, truncation.
-        row += (4 if guides else 3) * learner.env.action_size + 4
+        row += 3 * learner.env.action_size + (32 if guides else 0) + 4
         return {
             "bytes_per_env": _bytes(self.state.env_state) / self.config.num_envs,
             "rollout_bytes_per_env": 4 * row * self.config.ppo.unroll,

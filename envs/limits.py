@@ -58,6 +58,7 @@ LIMITS: dict[str, tuple[float, float]] = {
     "tg.base_frequency": (0.1, 10.0),
     "tg.frequency_range": (0.0, 5.0),
     "tg.step_length": (0.0, 0.5),
+    "tg.retraction": _SHARE,
     "tg.lift": (0.0, 0.5),
     "tg.lift_range": (0.0, 0.5),
     "tg.lift_min": (0.0, 0.5),

@@ -13,7 +13,9 @@ from tlq import insight, session
 from tlq.render import RenderError
 from tlq.session import Session
 
-SMALL = {"policy.encoder": 8, "policy.head": 8, "policy.memory_width": 4}
+# A gait that stays up for a second or two without a policy.
+GAIT = {"env.tg.base_frequency": 1.6, "env.tg.step_length": 0.2, "env.tg.retraction": 0.0}
+SMALL = {"policy.encoder": 8, "policy.head": 8, "policy.memory_width": 4, **GAIT}
 
 
 @pytest.fixture(scope="module")
@@ -237,7 +239,7 @@ def test_points_and_paths_are_at_the_feet(flat):
     span = np.ptp(paths, axis=1)
     np.testing.assert_allclose(span[:, 0], core.config.step_length, atol=0.01)
     np.testing.assert_allclose(span[:, 2], flat.sim.controller.state.lift, atol=0.01)
-    assert np.abs(flat.lift_change).max() < 1e-3 and abs(flat.frequency_change) < 1e-3
+    assert np.abs(flat.lift_change).max() < 1e-3 and abs(flat.frequency_change) < 5e-3
 
 
 def test_reward_terms_are_those_of_training(flat):
