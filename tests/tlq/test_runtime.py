@@ -136,17 +136,21 @@ def test_needs_neither_jax_nor_mujoco(file):
     assert done.stdout.strip() == "[]"
 
 
-def test_a_step_takes_about_half_a_millisecond(file):
-    """Twice what is promised: the bound must hold on slow and on busy machines; a figure is not tested here."""
+def test_a_step_costs_some_thousand_small_additions(file):
+    """A ratio of two things run in turn, as machines differ and are busy: 1,500 to 1,700 additions of 64 numbers."""
     controller = Controller(file)
     inputs = next(walk(controller, np.random.default_rng(3), 1))
-    times = []
-    for _ in range(20):  # the best block: other programs may be using the machine
+    numbers = np.ones(64, np.float32)
+    ratios = []
+    for _ in range(20):
         start = time.process_time()
-        for _ in range(50):
+        for _ in range(5000):
+            numbers + numbers
+        middle = time.process_time()
+        for _ in range(20):
             controller.step(*inputs)
-        times.append((time.process_time() - start) / 50)
-    assert min(times) < 1e-3
+        ratios.append((time.process_time() - middle) / 20 / ((middle - start) / 5000))
+    assert np.median(ratios) < 3500
 
 
 # -- inputs ----------------------------------------------------------------------------------------------------------
