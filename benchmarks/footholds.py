@@ -41,8 +41,8 @@ SETTLED = 3
 """Control steps after which a foot stands."""
 AT_LIMIT = 0.9
 """Residual action from which it counts as being at its limit, 1."""
-LET_GO = 1.0
-"""Phase (rad) of swing up to which a foot that lifts off forgets where it was led."""
+LET_GO, KEPT = 1.0, 0.85
+"""Phase (rad) of swing up to which a foot that lifts off forgets where it was led, and the share that a step keeps."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,6 +54,9 @@ class Options:
     difficulty: float = cli.option(0.5, "in [0, 1]")
     depth: float = cli.option(0.02, "of the pits for the feet (m)")
     reflex: bool = cli.option(False, "lead the feet by the reflex")
+    retraction: float = cli.option(-1.0, "share of retraction of the feet; negative: the policy's own")
+    frequency: float = cli.option(0.0, "gait cycles per second at action 0 (Hz); 0: the policy's own")
+    step_length: float = cli.option(0.0, "of the gait (m); 0: the policy's own")
     robots: int = cli.option(96, "episodes, two on each terrain")
     seconds: float = cli.option(8.0, "longest episode")
     json: str = cli.option("", "file for the result")
@@ -61,9 +64,16 @@ class Options:
 
 def make_env(policy: Policy, options: Options) -> envs.QuadrupedEnv:
     """The policy's own environment on one level, without pushes."""
+    own = training_env(policy.metadata)
+    gait = {
+        "tg.retraction": options.retraction if options.retraction >= 0 else own.tg.retraction,
+        "tg.base_frequency": options.frequency or own.tg.base_frequency,
+        "tg.step_length": options.step_length or own.tg.step_length,
+    }
     config = settings.changed(
-        training_env(policy.metadata),
-        {
+        own,
+        gait
+        | {
             "terrain.kind": options.terrain,
             "terrain.num_terrains": (options.robots + 1) // 2,
             "terrain.seed": FIRST_SEED,
@@ -84,7 +94,7 @@ def lead(env: envs.QuadrupedEnv, episode: envs.Episode, led: jax.Array) -> jax.A
     """
     wished, asked = guide.displacements(env, episode)
     phases = tg.path.leg_phases(episode.controller.phase)[:, None]
-    kept = jnp.where((phases > 0) & (phases < LET_GO), 0.85 * led, led)
+    kept = jnp.where((phases > 0) & (phases < LET_GO), KEPT * led, led)
     return jnp.where(asked[:, None], wished, kept)
 
 
@@ -124,6 +134,7 @@ def step(
         "swing_after": ~stance,
         "at_limit": jnp.any(jnp.abs(residual) > AT_LIMIT, axis=-1),
         "said": in_world(before, env.landing_points(before)),
+        "led": env.core.residual_displacement(episode.controller, envs.env.exact_sensors(episode))[:, :2],
         "feet": in_world(episode, env.core.feet(envs.env.exact_sensors(episode))[:, :2]),
         "command": episode.command,
     }
@@ -139,16 +150,25 @@ def landing_errors(shown: dict[str, np.ndarray], landed: np.ndarray) -> dict[str
     """How far (m) feet that stand since SETTLED steps are from where they were said to land, by steps before landing.
 
     shown: arrays (T, B, ...); landed: (T, B, L), the step that ends a swing. Medians; and how far beyond what was said
-    they are along the command, on average, at one step before.
+    they are along the command, on average, at one step before. `moved_on_m`: how far they still go from the step before
+    they land; `led_moves_m`: how far that step moves where the residuals lead them.
     """
     time, robot, leg = np.nonzero(landed[:-SETTLED])
     stands = shown["feet"][time + SETTLED, robot, leg]
-    errors = {}
+    feet, led = shown["feet"], shown["led"]
+
+    def median(moves: np.ndarray) -> float:
+        return float(np.median(np.linalg.norm(moves, axis=-1)))
+
+    errors = {
+        "moved_on_m": median(stands - feet[time - 1, robot, leg]),
+        "led_moves_m": median(led[time - 1, robot, leg] - led[time - 2, robot, leg]),
+    }
     for steps in AHEAD:
         then = np.maximum(time - steps + 1, 0)
         swung = shown["swing"][then, robot, leg]
         away = (stands - shown["said"][then, robot, leg])[swung]
-        errors[f"landing_error_{steps}_m"] = float(np.median(np.linalg.norm(away, axis=-1)))
+        errors[f"landing_error_{steps}_m"] = median(away)
         if steps == 1:
             along = np.sum(away * shown["command"][time, robot][swung], axis=-1)
             errors["landed_beyond_m"] = float(along.mean())
@@ -186,6 +206,8 @@ def main(arguments: Sequence[str]) -> None:
     options = cli.parse(Options, arguments, __doc__ or "")
     cli.check_folders(options, "json")
     terrains.parse_difficulty(options.difficulty)
+    if options.retraction > 1 or not 0 <= options.frequency <= 10 or not 0 <= options.step_length <= 0.5:
+        raise ValueError("retraction= must be at most 1, frequency= in [0, 10] and step_length= in [0, 0.5]")
     if options.robots < 1 or not 0 < options.seconds <= 600:
         raise ValueError("robots= must be at least 1, and seconds= in (0, 600]")
     settings.use_cache(settings.TrainConfig().cache)

@@ -90,9 +90,10 @@ class Environments:
         learner = self.learner
         here = jax.eval_shape(lambda: self.state.env_state.obs)
         row = sum(here[k].size for k in (*NORMALISED, "is_first")) / self.config.num_envs
-        guides = "guide" in self.state.env_state.info
-        # Action, its distribution, what the guide asks for; log-probability, reward, done, truncation.
-        row += 3 * learner.env.action_size + (32 if guides else 0) + 4
+        # Action, its distribution; log-probability, reward, done, truncation; what the guide asks for.
+        row += 3 * learner.env.action_size + 4
+        if "guide" in self.state.env_state.info:
+            row += self.state.env_state.info["guide"].size / self.config.num_envs
         return {
             "bytes_per_env": _bytes(self.state.env_state) / self.config.num_envs,
             "rollout_bytes_per_env": 4 * row * self.config.ppo.unroll,

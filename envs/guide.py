@@ -1,11 +1,11 @@
-"""Where feet in swing had better go: joint angles that training can imitate. It learns nothing itself.
+"""Where feet in swing had better go, as a wish that training can follow. It learns nothing itself.
 
 For the feet in swing, the true ground round the ends of their steps is searched for places where a foot that lands with
-some error hits no gap, and between which the robot keeps its balance; the guide says which residual joint angles lead
-there, all the way, from early in the swing on.
-The policy-gradient finds out only by trial which of twelve joint angles would have saved a footstep; this tells it
-(`ppo.guide` is the weight). An earlier guide asked for a share of the way as a change of the policy's own action: that
-has no fixed point but the ends of the action's range (docs/experiments.md).
+some error hits no gap, and between which the robot keeps its balance; the guide asks that the residual joint angles
+lead there, all the way, from early in the swing on. The policy-gradient finds out only by trial which of twelve joint
+angles would have saved a footstep; this tells it (`ppo.guide` is the weight). An earlier guide asked for a share of the
+way as a change of the policy's own action: that has no fixed point but the ends of the action's range
+(docs/experiments.md).
 """
 
 from typing import cast
@@ -42,10 +42,10 @@ SAFE = 0.02
 """Share of gap up to which a place is left alone."""
 LIFTING = 0.3
 """Phase (rad) of swing up to which a foot isn't sent anywhere."""
+FIRST = 0.3
+"""Share from which where a foot is led already tells of where it will be led: before, it is mostly noise."""
 ARRIVED = 1.5
 """Phase (rad) from which it is led all the way to its place; a share of it before: joints that jump upset the trunk."""
-LEGS_IN_SWING = 2
-"""At most, in a trot: more than these aren't looked at."""
 
 
 def places() -> np.ndarray:
@@ -54,10 +54,19 @@ def places() -> np.ndarray:
     return np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2)
 
 
-def weights() -> np.ndarray:
-    """(2 NEAR + 1, 2 NEAR + 1), how much the ground so many cells from a place counts; they sum to 1."""
-    axis = np.exp(-0.5 * np.square(np.arange(-NEAR, NEAR + 1) * CELL / ERROR))
-    return np.outer(axis, axis) / np.sum(axis) ** 2
+def gap_shares(env: QuadrupedEnv, episode: Episode, ends: jax.Array) -> jax.Array:
+    """How much gap (N, places) a foot meets that lands near one of `places`, from the ends (N, 2) m of the steps."""
+    axis = np.arange(-REACH - NEAR, REACH + NEAR + 1) * CELL
+    patch = jnp.asarray(np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1), jnp.float32)
+    heights = env._heights(episode, ends[:, None, None] + patch)
+    highest = jnp.max(heights, axis=(1, 2), keepdims=True)
+    low = (highest - heights > env.config.rewards.gap_threshold).astype(jnp.float32)
+    # A normal distribution is one along x times one along y.
+    weights = np.exp(-0.5 * np.square(np.arange(-NEAR, NEAR + 1) * CELL / ERROR))
+    n = 2 * REACH + 1
+    rows = sum(w * low[:, i : i + n] for i, w in enumerate(weights / weights.sum()))
+    shares = sum(w * rows[:, :, i : i + n] for i, w in enumerate(weights / weights.sum()))
+    return shares.reshape(len(ends), -1)
 
 
 def displacements(env: QuadrupedEnv, episode: Episode) -> tuple[jax.Array, jax.Array]:
@@ -69,21 +78,12 @@ def displacements(env: QuadrupedEnv, episode: Episode) -> tuple[jax.Array, jax.A
     """
     controller, sensors = episode.controller, exact_sensors(episode)
     phases = tg.path.leg_phases(controller.phase)
-    _, legs = jax.lax.top_k(phases, LEGS_IN_SWING)
+    _, legs = jax.lax.top_k(phases, 2)  # a trot has no more in swing
     ends = env.step_ends(episode)[legs]
-    axis = np.arange(-REACH - NEAR, REACH + NEAR + 1) * CELL
-    patch = jnp.asarray(np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1), jnp.float32)
-    heights = env._heights(episode, ends[:, None, None] + patch)
-    highest = jnp.max(heights, axis=(1, 2), keepdims=True)
-    low = (highest - heights > env.config.rewards.gap_threshold).astype(jnp.float32)
-    n = 2 * REACH + 1
-    # Separable: first along one axis, then along the other.
-    line = np.sqrt(np.diag(weights()))
-    rows = sum(w * low[:, i : i + n] for i, w in enumerate(line))
-    gaps = sum(w * rows[:, :, i : i + n] for i, w in enumerate(line)).reshape(len(legs), -1)
+    gaps = gap_shares(env, episode, ends)
     now = env.core.residual_displacement(controller, sensors)[legs, :2]
     share = tg.path.smoothstep(jnp.clip((phases[legs] - LIFTING) / (ARRIVED - LIFTING), 0.0, 1.0))[:, None]
-    now = jnp.clip(now / jnp.maximum(share, 0.3), -REACH * CELL, REACH * CELL)
+    now = jnp.clip(now / jnp.maximum(share, FIRST), -REACH * CELL, REACH * CELL)
     away = jnp.linalg.norm(now[:, None] - places(), axis=-1)
     # The mean speed of feet in stance.
     speed = 2.0 * controller.frequency * env.core.config.step_length

@@ -38,4 +38,5 @@ def test_footholds(tmp_path):
     arguments = ["policy=flat", "difficulty=0.5", "robots=8", "seconds=2.5", "reflex=true"]
     found = result("footholds", arguments, tmp_path)
     assert 0.5 < found["distance_m"] <= 5 and 0 <= found["stance_over_gap"] <= 1
+    assert 0 < found["moved_on_m"] < 0.1 and 0 < found["led_moves_m"] < 0.1
     assert 0 < found["landing_error_1_m"] < found["landing_error_8_m"] < 0.2

@@ -25,7 +25,7 @@ HEIGHT_CLIP = 0.25
 TURN_CLIP = 0.5
 """The turn since the start is shown up to ± this (rad), so that a robot turned round by hand sees nothing new."""
 LAG = 0.07
-"""Time constant (s) with which joints catch up with what is asked of them: from the same."""
+"""Time constant (s) with which joints catch up with what is asked of them: docs/experiments.md."""
 SMOOTHING = 0.3
 """Share of a new measurement in the velocity that the stance legs tell of."""
 
@@ -165,10 +165,10 @@ class Core:
         if not self.config.look_ahead:
             return feet
         xp = feet.__array_namespace__()
-        landing = self.step_ends(state, sensors, self.odometry(state, sensors))
+        ends = self.step_ends(state, sensors, self.odometry(state, sensors))
         # A robot that stands still has feet in swing by their phase, but they stay where they are.
         share = xp.where(path.leg_phases(state.phase) > 0, state.gate, 0.0 * state.gate)[:, None]
-        return feet + share * (landing - feet)
+        return feet + share * (ends - feet)
 
     def around(self, centres: Array) -> Array:
         """The points (4, 25, 2) m of the circles round places (4, 2 or 3) m."""
@@ -203,8 +203,8 @@ class Core:
     def step_ends(self, state: ControllerState, sensors: Sensors, velocity: Array) -> Array:
         """Where the trajectory generator leads feet in swing: (4, 2) m from the trunk's centre, heading frame.
 
-        The end of the step, and the trunk's way until then at its velocity (2,) m/s. Residual joint angles
-        are left out, so that a foothold seen from there stays where it is while they lead the foot to it.
+        The end of the step, and the trunk's way until then at its velocity (2,) m/s. Residual joint angles are left
+        out, so that a foothold seen from there stays where it is while they lead the foot to it.
         """
         xp = state.targets.__array_namespace__()
         level = frames.heading_from_trunk(frames.up_in_trunk(sensors.orientation))

@@ -44,7 +44,7 @@ def stride(phase: Array, retraction: float = 0.0) -> Array:
     """d_l: position of a foot along its step, from -½ (lift-off) to ½ (touch-down) in swing and back in stance.
 
     The paper's is S(|p/π|) - ½. It stops the foot under the trunk at touch-down, so that it comes down with the trunk's
-    speed and slides, and moves in stance at any speed but the trunk's. With a retraction of 1 a foot in stance moves
+    speed, and moves in stance at any speed but the trunk's. With a retraction of 1 a foot in stance moves
     evenly and in swing has the ground's speed at both ends. Mean stance speed is 2 f L.
 
     Args:

@@ -98,7 +98,7 @@ def _guide_loss(wish: jax.Array, parameters: jax.Array) -> jax.Array:
       wish: (T, B, L, 2, 4), of `envs.guide.guide`.
       parameters: (T, B, 2 A), of the new policy.
     """
-    mean = jnp.tanh(jnp.split(parameters, 2, axis=-1)[0])
+    mean = jnp.tanh(jnp.split(parameters, 2, axis=-1)[0])  # of δf, δh, residuals
     residual = mean[..., 2:].reshape(*wish.shape[:3], 3)
     away = jnp.einsum("tblij,tblj->tbli", wish[..., :3], residual) - wish[..., 3]
     return jnp.mean(jnp.sum(jnp.square(away / FAR), axis=(-2, -1)))
