@@ -136,8 +136,9 @@ class Parts:
         return e.replace(qpos=e.qpos + NOTHING * jnp.sum(seen))
 
     def guide(self, e: envs.Episode) -> envs.Episode:
-        """What the guide to footholds asks for, once."""
-        return e.replace(qpos=e.qpos + NOTHING * jnp.sum(guide.guide(self.env, e)))
+        """What the guide to footholds says, once."""
+        total = sum(jnp.sum(x, dtype=jnp.float32) for x in guide.guide(self.env, e))
+        return e.replace(qpos=e.qpos + NOTHING * total)
 
     def policy(self, steps: int) -> Callable[[], Any]:
         """The policy's steps, with sampling."""

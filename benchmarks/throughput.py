@@ -90,13 +90,12 @@ class Environments:
         learner = self.learner
         here = jax.eval_shape(lambda: self.state.env_state.obs)
         row = sum(here[k].size for k in (*NORMALISED, "is_first")) / self.config.num_envs
-        # Action, its distribution; log-probability, reward, done, truncation; what the guide asks for.
+        # Action, its distribution; log-probability, reward, done, truncation.
         row += 3 * learner.env.action_size + 4
-        if "guide" in self.state.env_state.info:
-            row += self.state.env_state.info["guide"].size / self.config.num_envs
+        guided = _bytes(self.state.env_state.info.get("guide")) / self.config.num_envs
         return {
             "bytes_per_env": _bytes(self.state.env_state) / self.config.num_envs,
-            "rollout_bytes_per_env": 4 * row * self.config.ppo.unroll,
+            "rollout_bytes_per_env": (4 * row + guided) * self.config.ppo.unroll,
             "bytes_per_terrain": self.bank.nbytes / self.bank.num_terrains,
             "parameters": sum(x.size for x in jax.tree.leaves(self.state.params)),
         }

@@ -3,7 +3,7 @@
 from envs.auto_reset import AutoReset
 from envs.config import EVALUATION_ITERATIONS, METHODS, CurriculumConfig, EnvConfig, RandomisationConfig
 from envs.env import GOAL, QuadrupedEnv
-from envs.guide import Guided
+from envs.guide import Guidance, Guided
 from envs.robot import ROBOTS, RobotConfig
 from envs.types import Episode, Randomised
 
@@ -22,6 +22,7 @@ __all__ = [
     "CurriculumConfig",
     "EnvConfig",
     "Episode",
+    "Guidance",
     "Guided",
     "QuadrupedEnv",
     "Randomised",

@@ -1,14 +1,13 @@
-"""Where feet in swing had better go, as a wish that training can follow. It learns nothing itself.
+"""Where feet in swing had better go, as a cost of actions that training can lower. It learns nothing itself.
 
-For the feet in swing, the true ground round the ends of their steps is searched for places where a foot that lands with
-some error hits no gap, and between which the robot keeps its balance; the guide asks that the residual joint angles
-lead there, all the way, from early in the swing on. The policy-gradient finds out only by trial which of twelve joint
-angles would have saved a footstep; this tells it (`ppo.guide` is the weight). An earlier guide asked for a share of the
-way as a change of the policy's own action: that has no fixed point but the ends of the action's range
-(docs/experiments.md).
+For the feet in swing, the true ground round the ends of their steps is searched for gaps. What an action costs is how
+much gap the feet would meet where its residual joint angles lead them, if they land with some error, and how far that
+is from where the robot keeps its balance. The policy-gradient finds out only by trial which of twelve joint angles
+would have saved a footstep; this tells it, by its slope (`ppo.guide` is the weight). Imitating the best places instead
+was tried: which one is best is ambiguous, and the mean of two poles is a gap (docs/experiments.md).
 """
 
-from typing import cast
+from typing import NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -25,6 +24,8 @@ REACH = 5
 """A foot can be sent this many cells to each side of the end of its step."""
 ERROR = 0.025
 """Standard deviation (m) of a landing foot from its place, by which the gaps near a place count."""
+SIDE = 2 * REACH + 1
+"""Places along one axis."""
 NEAR = 2
 """Cells to each side of a place that count."""
 FARTHER, ANOTHER = 1.0, 2.0
@@ -34,6 +35,8 @@ BALANCE = 0.15
 """Seconds of the trunk's excess speed that a foot is placed farther along, as a walking inverted pendulum asks for."""
 ACROSS = 6.0
 """What a metre costs by which the line between two feet in swing is moved across, from where balance wants it."""
+BEYOND = 10.0
+"""What a metre costs by which a foot is led beyond the places that were looked at."""
 CANDIDATES = 16
 """Places of each foot, the best ones alone, of which the best pair is taken."""
 AWAY = 0.1
@@ -63,40 +66,76 @@ def gap_shares(env: QuadrupedEnv, episode: Episode, ends: jax.Array) -> jax.Arra
     low = (highest - heights > env.config.rewards.gap_threshold).astype(jnp.float32)
     # A normal distribution is one along x times one along y.
     weights = np.exp(-0.5 * np.square(np.arange(-NEAR, NEAR + 1) * CELL / ERROR))
-    n = 2 * REACH + 1
-    rows = sum(w * low[:, i : i + n] for i, w in enumerate(weights / weights.sum()))
-    shares = sum(w * rows[:, :, i : i + n] for i, w in enumerate(weights / weights.sum()))
+    rows = sum(w * low[:, i : i + SIDE] for i, w in enumerate(weights / weights.sum()))
+    shares = sum(w * rows[:, :, i : i + SIDE] for i, w in enumerate(weights / weights.sum()))
     return shares.reshape(len(ends), -1)
 
 
-def displacements(env: QuadrupedEnv, episode: Episode) -> tuple[jax.Array, jax.Array]:
-    """Where the feet had better be led, and whether they are to be led at all.
+class Steps(NamedTuple):
+    """The two feet farthest into their swing, and the ground where they may land. Heading frame, N places each."""
 
-    Returns:
-      Displacement (L, 2) m from the trajectory generator's path, heading frame, and (L,) bool: not in stance, nor where
-      the ground has no gap near the end of the step, neither with the foot's displacement so far nor without.
-    """
+    legs: jax.Array
+    """(2,) int32."""
+    ends: jax.Array
+    """(2, 2) m from the trunk's centre, where the trajectory generator leads them."""
+    share: jax.Array
+    """(2,) of the way to a foothold that a foot should be led by now."""
+    now: jax.Array
+    """(2, 2) m, where they are led already, from `ends`, made up for what `share` holds back."""
+    gaps: jax.Array
+    """(2, N) share of gap that a foot meets there."""
+    ahead: jax.Array
+    """(2,) m, the displacement that balance asks for."""
+    asked: jax.Array
+    """(2,) bool: in swing, and a gap near the end of the step or near where they are led."""
+
+
+def steps(env: QuadrupedEnv, episode: Episode) -> Steps:
+    """The steps that an episode's feet are about to end."""
     controller, sensors = episode.controller, exact_sensors(episode)
     phases = tg.path.leg_phases(controller.phase)
     _, legs = jax.lax.top_k(phases, 2)  # a trot has no more in swing
     ends = env.step_ends(episode)[legs]
     gaps = gap_shares(env, episode, ends)
-    now = env.core.residual_displacement(controller, sensors)[legs, :2]
-    share = tg.path.smoothstep(jnp.clip((phases[legs] - LIFTING) / (ARRIVED - LIFTING), 0.0, 1.0))[:, None]
-    now = jnp.clip(now / jnp.maximum(share, FIRST), -REACH * CELL, REACH * CELL)
-    away = jnp.linalg.norm(now[:, None] - places(), axis=-1)
+    share = tg.path.smoothstep(jnp.clip((phases[legs] - LIFTING) / (ARRIVED - LIFTING), 0.0, 1.0))
+    now = env.core.residual_displacement(controller, sensors)[legs, :2] / jnp.maximum(share, FIRST)[:, None]
+    now = jnp.clip(now, -REACH * CELL, REACH * CELL)
     # The mean speed of feet in stance.
     speed = 2.0 * controller.frequency * env.core.config.step_length
     ahead = jnp.clip(BALANCE * (env.velocity(episode) - speed * controller.stride), -AWAY, AWAY)
-    far = jnp.linalg.norm(ahead - places(), axis=-1)
-    cost = gaps + FARTHER * far + ANOTHER * away
-    best = _best_pair(cost, ahead, ends[0] - ends[1])
-    here = jnp.take_along_axis(gaps, jnp.argmin(away, axis=1)[:, None], axis=1)[:, 0]
-    danger = jnp.maximum(here, gaps[:, len(places()) // 2]) > SAFE
+    here = between(gaps.reshape(2, SIDE, SIDE), now)
+    danger = jnp.maximum(here, gaps[:, SIDE * SIDE // 2]) > SAFE
     walking = jnp.sum(jnp.square(episode.command)) > 0.5
-    asked = danger & (phases[legs] > LIFTING) & walking
-    led = jnp.zeros((4, 2)).at[legs].set(share * best)
-    return led, jnp.zeros(4, bool).at[legs].set(asked)
+    return Steps(legs, ends, share, now, gaps, ahead, danger & (phases[legs] > LIFTING) & walking)
+
+
+def between(gaps: jax.Array, displacement: jax.Array) -> jax.Array:
+    """Bilinear share (...) of gap at displacements (..., 2) m, of a map (..., SIDE, SIDE); at its rim beyond it."""
+    at = jnp.clip(displacement / CELL + REACH, 0.0, SIDE - 1.001)
+    low = jnp.floor(at).astype(jnp.int32)
+    x, y = jnp.moveaxis(at - low, -1, 0)
+    flat = gaps.reshape(*gaps.shape[:-2], SIDE * SIDE)
+    corner = low[..., 0] * SIDE + low[..., 1]
+
+    def value(step: int) -> jax.Array:
+        return jnp.take_along_axis(flat, corner[..., None] + step, axis=-1)[..., 0]
+
+    return (1 - x) * ((1 - y) * value(0) + y * value(1)) + x * ((1 - y) * value(SIDE) + y * value(SIDE + 1))
+
+
+def displacements(env: QuadrupedEnv, episode: Episode) -> tuple[jax.Array, jax.Array]:
+    """The best places for the feet, which a reflex leads them to (`benchmarks.footholds`).
+
+    Returns:
+      Displacement (L, 2) m from the trajectory generator's path, heading frame, and (L,) bool: not in stance, nor where
+      the ground has no gap near the end of the step, neither with the foot's displacement so far nor without.
+    """
+    s = steps(env, episode)
+    away = jnp.linalg.norm(s.now[:, None] - places(), axis=-1)
+    far = jnp.linalg.norm(s.ahead - places(), axis=-1)
+    best = _best_pair(s.gaps + FARTHER * far + ANOTHER * away, s.ahead, s.ends[0] - s.ends[1])
+    led = jnp.zeros((4, 2)).at[s.legs].set(s.share[:, None] * best)
+    return led, jnp.zeros(4, bool).at[s.legs].set(s.asked)
 
 
 def _best_pair(cost: jax.Array, ahead: jax.Array, line: jax.Array) -> jax.Array:
@@ -112,11 +151,15 @@ def _best_pair(cost: jax.Array, ahead: jax.Array, line: jax.Array) -> jax.Array:
     """
     least, which = jax.lax.top_k(-cost, CANDIDATES)
     at = jnp.asarray(places(), jnp.float32)[which]
-    across = jnp.stack([-line[1], line[0]]) / jnp.maximum(jnp.linalg.norm(line), 0.1)
-    off = (at - ahead) @ across
+    off = (at - ahead) @ _across(line)
     together = -least[0][:, None] - least[1] + ACROSS * jnp.abs(off[0][:, None] + off[1]) / 2
     first, second = jnp.unravel_index(jnp.argmin(together), together.shape)
     return jnp.stack([at[0, first], at[1, second]])
+
+
+def _across(line: jax.Array) -> jax.Array:
+    """Unit vector (2,) across a line (2,) m."""
+    return jnp.stack([-line[1], line[0]]) / jnp.maximum(jnp.linalg.norm(line), 0.1)
 
 
 def residuals(env: QuadrupedEnv, episode: Episode, displacement: jax.Array) -> jax.Array:
@@ -138,33 +181,80 @@ def _target(env: QuadrupedEnv, episode: Episode) -> tuple[jax.Array, jax.Array]:
     return target, tg.frames.heading_from_trunk(tg.frames.up_in_trunk(sensors.orientation))
 
 
-def guide(env: QuadrupedEnv, episode: Episode) -> jax.Array:
-    """The guide's wish for the next action: (L, 2, 4), zero where it has none.
+class Guidance(NamedTuple):
+    """What `cost` reads. Legs and sides are the policy's, mirrored if its observation is."""
 
-    Of leg l, [:, :3] is how far (m) its residual actions move the foot, forwards and left, and [:, 3] how far they
-    should. The leg's height is left to the policy. Legs and sides are the policy's, mirrored if its observation is.
-    """
-    led, asked = displacements(env, episode)
+    legs: jax.Array
+    """(2,) int32, the feet that it is about."""
+    lead: jax.Array
+    """(2, 2, 4) m: residual actions (3,) of a leg move its foot by lead[:, :3] @ residual + lead[:, 3], forwards and
+    left. The height is left to the policy."""
+    gaps: jax.Array
+    """(2, SIDE, SIDE) float16, share of gap at each place."""
+    ahead: jax.Array
+    """(2,) m, the displacement that balance asks for."""
+    across: jax.Array
+    """(2,) unit vector across the line between the two steps' ends."""
+    weight: jax.Array
+    """(2,) how much each foot counts, 0 where it had better be left alone."""
+
+
+def guide(env: QuadrupedEnv, episode: Episode) -> Guidance:
+    """What there is to say about the next action's footholds."""
+    s, core = steps(env, episode), env.core
     target, level = _target(env, episode)
-    # Half way there the slope is that of the whole way.
-    half = tg.leg.inverse(env.core.geometry, target + 0.5 * jnp.pad(led, ((0, 0), (0, 1))) @ level)
+    last = episode.controller.actions[0][2:].reshape(4, 3)
+    standing = tg.leg.inverse(core.geometry, target)
 
-    def feet(angles: jax.Array) -> jax.Array:
-        return tg.leg.forward(env.core.geometry, angles) @ level.T
+    def feet(action: jax.Array) -> jax.Array:
+        reached = tg.leg.forward(core.geometry, standing + core.config.residual_range * action)
+        return ((reached - target) @ level.T)[:, :2]
 
-    def turned(joint: int) -> jax.Array:
-        return jax.jvp(feet, (half,), (jnp.zeros_like(half).at[:, joint].set(1.0),))[1]
+    def turned(joint: int) -> tuple[jax.Array, jax.Array]:
+        return jax.jvp(feet, (last,), (jnp.zeros_like(last).at[:, joint].set(1.0),))
 
-    slope = env.core.config.residual_range * jnp.stack([turned(j) for j in range(3)], axis=-1)[:, :2]
-    wish = jnp.where(asked[:, None, None], jnp.concatenate([slope, led[..., None]], axis=-1), 0.0)
-    mirror = env.core.update_mirror(episode.controller.mirror, env.heading_command(episode))
+    # Round the last action, from which the next doesn't differ by much.
+    moved, *slopes = turned(0)[0], *(turned(joint)[1] for joint in range(3))
+    slope = jnp.stack(slopes, axis=-1)
+    rest = moved - jnp.einsum("lij,lj->li", slope, last)
+    lead = jnp.concatenate([slope, rest[..., None]], axis=-1)[s.legs]
+    gaps = s.gaps.reshape(2, SIDE, SIDE).astype(jnp.float16)
+    across, weight = _across(s.ends[0] - s.ends[1]), jnp.where(s.asked, s.share, 0.0)
+    mirror = core.update_mirror(episode.controller.mirror, env.heading_command(episode))
     # In the mirror left is right, and the abduction joints turn the other way.
-    other = wish[jnp.array([1, 0, 3, 2])] * jnp.asarray([[-1.0, 1.0, 1.0, 1.0], [1.0, -1.0, -1.0, -1.0]])
-    return jnp.where(mirror > 0, wish, other)
+    side = jnp.array([1.0, -1.0])
+    other = Guidance(
+        jnp.array([1, 0, 3, 2], jnp.int32)[s.legs],
+        lead * jnp.asarray([[-1.0, 1.0, 1.0, 1.0], [1.0, -1.0, -1.0, -1.0]]),
+        gaps[:, :, ::-1],
+        s.ahead * side,
+        across * side,
+        weight,
+    )
+    own = Guidance(s.legs.astype(jnp.int32), lead, gaps, s.ahead, across, weight)
+    return jax.tree.map(lambda mine, mirrored: jnp.where(mirror > 0, mine, mirrored), own, other)
+
+
+def cost(guidance: Guidance, action: jax.Array) -> jax.Array:
+    """What the footholds cost (...) to which actions (..., 14) lead: gaps, and imbalance.
+
+    To be lowered by its slope: of several places an action slides into the nearest. The mean of the best places, which
+    imitation ends at where they are ambiguous, may be a gap.
+    """
+    residual = action[..., 2:].reshape(*action.shape[:-1], 4, 3)
+    residual = jnp.take_along_axis(residual, guidance.legs[..., None], axis=-2)
+    led = jnp.sum(guidance.lead[..., :3] * residual[..., None, :], axis=-1) + guidance.lead[..., 3]
+    beyond = jnp.sum(jnp.maximum(jnp.abs(led) - REACH * CELL, 0.0), axis=-1)
+    off = led - guidance.ahead[..., None, :]
+    far = jnp.sqrt(jnp.sum(jnp.square(off), axis=-1) + 1e-6)  # a slope at 0, too
+    each = between(guidance.gaps.astype(jnp.float32), led) + FARTHER * far + BEYOND * beyond
+    middle = jnp.abs(jnp.sum(jnp.mean(off, axis=-2) * guidance.across, axis=-1))
+    both = jnp.min(guidance.weight, axis=-1)
+    return jnp.sum(guidance.weight * each, axis=-1) + both * ACROSS * middle
 
 
 class Guided(Wrapper):
-    """An environment whose state's info has, as 'guide' (L, 2, 4), the guide's wish for the next action."""
+    """An environment whose state's info has, as 'guide', the `Guidance` for the next action."""
 
     def __init__(self, env: Env):
         super().__init__(env)

@@ -13,6 +13,8 @@ import jax.numpy as jnp
 from brax.training.agents.ppo.losses import PPONetworkParams, compute_gae
 from brax.training.agents.ppo.networks import PPONetworks
 
+from envs import guide
+
 if TYPE_CHECKING:
     from tlq.ppo import PPOConfig, Rollout
 
@@ -70,7 +72,10 @@ def ppo_loss(
     value_loss = 0.5 * config.value_loss * jnp.mean(jnp.square(targets - values))
     by_env = jax.vmap(lambda p, key: distribution.entropy({"action": p}, key), in_axes=(1, 0), out_axes=1)
     entropy_loss = -config.entropy * jnp.mean(by_env(parameters["action"], keys))
-    guide_loss = _guide_loss(rollout.guide, parameters["action"]) if rollout.guide.size else jnp.float32(0)
+    guide_loss = jnp.float32(0)
+    if rollout.guide is not None:
+        mean = jnp.tanh(jnp.split(parameters["action"], 2, axis=-1)[0])
+        guide_loss = jnp.mean(guide.cost(rollout.guide, mean))
     total = policy_loss + value_loss + entropy_loss + config.guide * guide_loss
 
     new = distribution.create_dist(parameters)
@@ -85,20 +90,3 @@ def ppo_loss(
         "std": jnp.mean(new.scale),
         "std_max": jnp.max(new.scale),
     }
-
-
-FAR = 0.1
-"""Distance (m) of a foot from where the guide wants it that costs 1."""
-
-
-def _guide_loss(wish: jax.Array, parameters: jax.Array) -> jax.Array:
-    """Mean square distance (), summed over the feet, from where the guide wants them to where the mean action leads.
-
-    Args:
-      wish: (T, B, L, 2, 4), of `envs.guide.guide`.
-      parameters: (T, B, 2 A), of the new policy.
-    """
-    mean = jnp.tanh(jnp.split(parameters, 2, axis=-1)[0])  # of δf, δh, residuals
-    residual = mean[..., 2:].reshape(*wish.shape[:3], 3)
-    away = jnp.einsum("tblij,tblj->tbli", wish[..., :3], residual) - wish[..., 3]
-    return jnp.mean(jnp.sum(jnp.square(away / FAR), axis=(-2, -1)))

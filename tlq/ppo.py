@@ -23,6 +23,7 @@ from brax.training.agents.ppo.networks import PPONetworks
 from jax.sharding import Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
 
+from envs import Guidance
 from tlq.loss import ppo_loss
 
 AXIS = "data"
@@ -64,8 +65,8 @@ class PPOConfig:
     reward_scaling: float = 0.1
     """Factor on the reward."""
     guide: float = 4.0
-    """Weight with which the policy imitates the scripted guide to footholds (envs/guide.py) where the terrain has pits;
-    0: it learns alone."""
+    """Weight of what footholds cost by the scripted guide (envs/guide.py) where the terrain has pits; 0: the policy
+    learns them by reward alone."""
 
 
 @flax.struct.dataclass
@@ -92,7 +93,7 @@ class Rollout:
     reward: jax.Array  # (T, B)
     done: jax.Array  # (T, B)
     truncation: jax.Array  # (T, B)
-    guide: jax.Array  # (T, B, L, 2, 4) what a guide asks for, see envs/guide.py; (T, B, 0) without one
+    guide: Guidance | None  # (T, B, ...) what a guide to footholds says, if there is one
 
 
 def make_mesh(num_devices: int = 0) -> Mesh:
@@ -184,8 +185,9 @@ class Learner:
         shared = jax.shard_map(roll, mesh=self.mesh, in_specs=specs[0], out_specs=specs[1], check_vma=False)
         rollout, carry, last = jax.jit(shared)(self._step_constants, state)
         parts = {f.name: getattr(rollout, f.name) for f in dataclasses.fields(rollout)}
-        observation = parts.pop("observation")
-        return parts | observation | {"carry": carry, "last": last}
+        observation, guidance = parts.pop("observation"), parts.pop("guide")
+        guidance = {f"guide_{k}": x for k, x in guidance._asdict().items()} if guidance else {}
+        return parts | observation | guidance | {"carry": carry, "last": last}
 
     # -- state ---------------------------------------------------------------------------------------------------------
 
@@ -294,7 +296,7 @@ class Learner:
                 reward=after.reward,
                 done=after.done,
                 truncation=after.info["truncation"],
-                guide=env_state.info.get("guide", jnp.zeros((*after.done.shape, 0))),
+                guide=env_state.info.get("guide"),
             )
             metrics = {k: jnp.mean(v) for k, v in after.metrics.items()}
             return after, (rollout, dict(metrics, reward=jnp.mean(after.reward)))

@@ -1,9 +1,10 @@
-"""The guide against a slow loop on true terrain, and what its action does to the feet."""
+"""The guide against slow loops on true terrain and MuJoCo's feet, and where the slope of its cost leads."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy import interpolate
 
 import envs
 import terrains
@@ -81,7 +82,10 @@ def test_feet_are_led_to_the_best_ground_near(exact, command):
             away = np.linalg.norm(now - guide.places(), axis=1)
             far = np.linalg.norm(balance - guide.places(), axis=1)
             costs.append(gaps + guide.FARTHER * far + guide.ANOTHER * away)
-            danger = max(gaps[len(gaps) // 2], gaps[int(np.argmin(away))])
+            axis = np.arange(-guide.REACH, guide.REACH + 1) * guide.CELL
+            table = gaps.reshape(guide.SIDE, guide.SIDE)
+            here = interpolate.RegularGridInterpolator((axis, axis), table)(now)[0]
+            danger = max(gaps[len(gaps) // 2], here)
             if abs(danger - guide.SAFE) > 1e-4:
                 assert asked[leg] == (danger > guide.SAFE and phases[leg] > guide.LIFTING)
         if shares[0] < 0.01:
@@ -103,50 +107,128 @@ def test_feet_are_led_to_the_best_ground_near(exact, command):
     assert led > 5
 
 
+def feet_by_mujoco(exact, episode, action):
+    """Feet (L, 2) m, heading frame, of the trajectory generator's next targets and residual actions of the robot's."""
+    env, core, controller = exact.env, exact.env.core, episode.controller
+    phase = tg.path.advance(np.asarray(controller.phase), np.float32(controller.frequency), 0.02)
+    target = core.foot_targets(
+        tg.path.leg_phases(phase),
+        np.asarray(controller.lift),
+        np.asarray(controller.stride),
+        exact_sensors(episode),
+    )
+    qpos = np.array(episode.qpos)
+    angles = np.asarray(tg.leg.inverse(core.geometry, target)).ravel()
+    qpos[7:] = angles + core.config.residual_range * np.asarray(action)[2:]
+    feet = exact.kinematics(qpos).site_xpos[env.robot.foot_site_ids, :2]
+    return tg.frames.turn(-tg.frames.yaw(np.asarray(episode.qpos[3:7])), feet)
+
+
 @pytest.mark.parametrize("command", [LEFT, RIGHT])
 @pytest.mark.parametrize("mirror", [1.0, -1.0])
-def test_the_wish_is_about_the_policys_own_actions(exact, command, mirror):
-    """Residuals that lead MuJoCo's feet there fulfil it, mirrored if the policy is; stance legs are free."""
+def test_guidance_is_about_the_policys_own_actions(exact, command, mirror):
+    """Legs, sides and what residual actions do are those of the mirror image if the policy sees that."""
     env, k, random = exact.env, exact.find("poles", 9), np.random.default_rng(1)
     core = env.core
-
-    @jax.jit
-    def all_of_it(episode):
-        led, wanted = guide.displacements(env, episode)
-        return guide.guide(env, episode), led, wanted, guide.residuals(env, episode, led)
-
+    both = jax.jit(lambda episode: (guide.guide(env, episode), guide.steps(env, episode)))
     asked = 0
     for xy in random.uniform(-1.2, 1.2, (6, 2)):
         episode = walking(exact, k, xy, command, phase=random.uniform(0.0, np.pi), mirror=mirror)
-        wish, led, wanted, own = map(np.asarray, all_of_it(episode))
+        last = random.uniform(-0.5, 0.5, 14).astype(np.float32)
+        controller = episode.controller
+        episode = episode.replace(
+            controller=controller._replace(actions=controller.actions.at[0].set(jnp.asarray(last)))
+        )
+        guidance, steps = jax.tree.map(np.asarray, both(episode))
         mirrored = core.update_mirror(episode.controller.mirror, env.heading_command(episode))
-        action = np.asarray(core.mirror_action(mirrored, np.concatenate([np.zeros(2), own.ravel()])))
-        away = np.einsum("lij,lj->li", wish[..., :3], action[2:].reshape(4, 3)) - wish[..., 3]
-        order = [0, 1, 2, 3] if mirrored > 0 else [1, 0, 3, 2]
-        np.testing.assert_allclose(away[wanted[order]], 0, atol=0.01)
-        np.testing.assert_array_equal(np.abs(wish).sum(axis=(1, 2)) > 0, wanted[order])
-        residual = core.config.residual_range * own
-        phases = tg.path.leg_phases(
-            tg.path.advance(
-                np.asarray(episode.controller.phase), np.float32(core.config.base_frequency), 0.02
-            )
+        side = np.array([1.0, mirrored])
+        np.testing.assert_array_equal(
+            np.array([0, 1, 2, 3] if mirrored > 0 else [1, 0, 3, 2])[steps.legs], guidance.legs
         )
-        target = core.foot_targets(
-            phases,
-            np.asarray(episode.controller.lift),
-            np.asarray(episode.controller.stride),
-            exact_sensors(episode),
-        )
-        angles = np.asarray(tg.leg.inverse(core.geometry, target))
-        feet = []
-        for q in (angles, angles + residual):
-            qpos = np.array(episode.qpos)
-            qpos[7:] = q.ravel()
-            feet.append(exact.kinematics(qpos).site_xpos[env.robot.foot_site_ids, :2].copy())
-        moved = tg.frames.turn(-tg.frames.yaw(np.asarray(episode.qpos[3:7])), feet[1] - feet[0])
-        np.testing.assert_allclose(moved, led, atol=1e-4)
-        asked += wanted.sum()
+        np.testing.assert_allclose(guidance.ahead, steps.ahead * side)
+        np.testing.assert_allclose(guidance.across @ (side * (steps.ends[0] - steps.ends[1])), 0, atol=1e-6)
+        np.testing.assert_allclose(np.linalg.norm(guidance.across), 1, rtol=1e-5)
+        np.testing.assert_allclose(guidance.weight, np.where(steps.asked, steps.share, 0))
+        gaps = guidance.gaps.reshape(2, guide.SIDE, guide.SIDE)[:, :, :: round(float(mirrored))]
+        np.testing.assert_allclose(gaps.reshape(2, -1), steps.gaps, atol=1e-3)
+        still = feet_by_mujoco(exact, episode, np.zeros(14))
+        for action, off in ((last, 1e-4), (last + random.uniform(-0.1, 0.1, 14), 2e-3)):
+            moved = (feet_by_mujoco(exact, episode, action) - still)[steps.legs] * side
+            own = np.asarray(core.mirror_action(mirrored, action))[2:].reshape(4, 3)[guidance.legs]
+            said = np.einsum("lij,lj->li", guidance.lead[..., :3], own) + guidance.lead[..., 3]
+            np.testing.assert_allclose(said, moved, atol=off)
+        asked += steps.asked.sum()
     assert asked > 2
+
+
+def test_residuals_lead_feet_where_they_should(exact):
+    env, k, random = exact.env, exact.find("poles", 9), np.random.default_rng(2)
+    residuals = jax.jit(lambda episode, led: guide.residuals(env, episode, led))
+    for xy in random.uniform(-1.2, 1.2, (3, 2)):
+        episode = walking(exact, k, xy, LEFT, phase=random.uniform(0.0, np.pi))
+        led = random.uniform(-0.05, 0.05, (4, 2))
+        action = np.concatenate([np.zeros(2), np.asarray(residuals(episode, jnp.asarray(led))).ravel()])
+        moved = feet_by_mujoco(exact, episode, action) - feet_by_mujoco(exact, episode, np.zeros(14))
+        np.testing.assert_allclose(moved, led, atol=1e-4)
+
+
+def slow_cost(guidance, action):
+    """`guide.cost` of one action, with scipy's interpolation and a loop."""
+    axis = np.arange(-guide.REACH, guide.REACH + 1) * guide.CELL
+    total, middle = 0.0, np.zeros(2)
+    for lead, gaps, leg, weight in zip(
+        guidance.lead, guidance.gaps, guidance.legs, guidance.weight, strict=True
+    ):
+        led = lead[:, :3] @ action[2 + 3 * leg : 5 + 3 * leg] + lead[:, 3]
+        inside = np.clip(led, axis[0], axis[-1])
+        gap = interpolate.RegularGridInterpolator((axis, axis), gaps.astype(float))(inside)[0]
+        away = np.linalg.norm(led - guidance.ahead)
+        total += weight * (gap + guide.FARTHER * away + guide.BEYOND * np.abs(led - inside).sum())
+        middle += (led - guidance.ahead) / 2
+    return total + guidance.weight.min() * guide.ACROSS * abs(middle @ guidance.across)
+
+
+def test_cost_against_a_loop():
+    random = np.random.default_rng(3)
+    for _ in range(50):
+        across = random.normal(size=2)
+        guidance = guide.Guidance(
+            legs=random.permutation(4)[:2].astype(np.int32),
+            lead=random.normal(scale=0.08, size=(2, 2, 4)).astype(np.float32),
+            gaps=random.uniform(size=(2, guide.SIDE, guide.SIDE)).astype(np.float16),
+            ahead=random.uniform(-0.1, 0.1, 2).astype(np.float32),
+            across=(across / np.linalg.norm(across)).astype(np.float32),
+            weight=random.uniform(0, 1, 2).astype(np.float32),
+        )
+        action = random.uniform(-1, 1, 14).astype(np.float32)
+        found = guide.cost(jax.tree.map(jnp.asarray, guidance), jnp.asarray(action))
+        np.testing.assert_allclose(found, slow_cost(guidance, action), atol=0.005)
+
+
+def test_its_slope_leads_feet_off_the_gaps(exact):
+    """Going down the slope of the cost from no residuals at all, feet end where there is less gap."""
+    env, k, random = exact.env, exact.find("poles", 9), np.random.default_rng(4)
+
+    @jax.jit
+    def descended(episode):
+        guidance = guide.guide(env, episode)
+
+        def gap(action):
+            own = action[2:].reshape(4, 3)[guidance.legs]
+            led = jnp.einsum("lij,lj->li", guidance.lead[..., :3], own) + guidance.lead[..., 3]
+            return guide.between(guidance.gaps.astype(jnp.float32), led) * (guidance.weight > 0.9)
+
+        slope = jax.grad(lambda action: guide.cost(guidance, action))
+        action = jax.lax.fori_loop(0, 200, lambda _, a: a - 0.01 * slope(a), jnp.zeros(14))
+        return gap(jnp.zeros(14)), gap(action)
+
+    pairs = []
+    for xy in random.uniform(-1.2, 1.2, (20, 2)):
+        episode = walking(exact, k, xy, LEFT, phase=random.uniform(1.6, np.pi))
+        pairs.append(np.asarray(descended(episode)))
+    before, after = np.mean(pairs, axis=(0, 2))
+    assert before > 0.1
+    assert after < 0.4 * before
 
 
 def test_only_terrain_with_gaps_has_pits(exact):
@@ -160,6 +242,7 @@ def test_a_guided_environment_adds_what_the_guide_asks_for(exact):
     state = jax.jit(env.reset)(jax.random.key(0))
     after = jax.jit(env.step)(state, jnp.zeros(14))
     alone = jax.jit(lambda episode: guide.guide(exact.env, episode))
-    np.testing.assert_allclose(after.info["guide"], alone(after.pipeline_state), atol=1e-6)
+    for added, own in zip(after.info["guide"], alone(after.pipeline_state), strict=True):
+        np.testing.assert_allclose(added, own, atol=1e-6)
     standing_still = change_episode(after.pipeline_state, command=np.zeros(2))
-    np.testing.assert_array_equal(alone(standing_still), 0)
+    np.testing.assert_array_equal(alone(standing_still).weight, 0)
