@@ -1,14 +1,14 @@
-"""Sphinx builds the site from the documents as they stand in the repository: sphinx-build -W -c docs . build/docs."""
+"""Sphinx builds the site from the documents as they stand: sphinx-build -E -W -c docs . build/site."""
 
 import sys
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-sys.path[:0] = [str(ROOT), str(ROOT / "docs")]
+sys.path.insert(0, str(ROOT))
 
 project = "tlq"
 html_title = "tlq"
-extensions = ["myst_parser", "sphinx.ext.autodoc", "generate"]
+extensions = ["myst_parser", "sphinx.ext.autodoc", "docs.generate"]
 
 # The source is the whole repository, so that a link between two documents is right on the site and in a file browser.
 root_doc = "docs/index"
@@ -20,7 +20,7 @@ exclude_patterns = [
 myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 4
 default_role = "code"
-nitpicky = False
+smartquotes = False
 
 autodoc_member_order = "bysource"
 autodoc_typehints = "signature"
@@ -38,3 +38,4 @@ html_theme_options = {
 }
 html_math_renderer = "mathml"
 html_copy_source = False
+html_show_copyright = False

@@ -7,6 +7,7 @@ A Sphinx extension with two directives for Markdown pages: `settings` (a datacla
 import dataclasses
 import importlib
 import re
+from collections.abc import Sequence
 from typing import Any
 
 from docutils import nodes
@@ -22,7 +23,7 @@ logger = logging.getLogger(__name__)
 Row = tuple[str, ...]
 
 
-def table(head: Row, rows: list[Row]) -> str:
+def table(head: Row, rows: Sequence[Row]) -> str:
     """A Markdown table."""
     lines = [head, tuple("---" for _ in head), *rows]
     return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines)

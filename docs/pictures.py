@@ -150,7 +150,9 @@ def frames() -> Any:
         for direction, letter in zip(axes.T, "xyz", strict=True):
             start, tip, text = (view.T @ (origin + r * direction) for r in (0.0, 0.25, 0.3))
             axis.annotate("", tip, start, arrowprops={"arrowstyle": "->", "color": colour, "shrinkA": 0})
-            axis.text(*text, f"{letter} {name}", color=colour, fontsize=8, ha="center", va="center")
+            axis.text(
+                text[0], text[1], f"{letter} {name}", color=colour, fontsize=8, ha="center", va="center"
+            )
     axis.set(aspect="equal", xlim=(-0.1, 1.0), ylim=(-0.15, 0.5))
     axis.set_axis_off()
     return figure
