@@ -31,7 +31,6 @@ html_theme = "alabaster"
 html_theme_options = {
     "page_width": "1100px",
     "body_max_width": "none",
-    "fixed_sidebar": True,
     "show_powered_by": False,
     "font_family": "system-ui, sans-serif",
     "head_font_family": "system-ui, sans-serif",

@@ -10,7 +10,7 @@ import tomllib
 
 import pytest
 
-from tests.pages import COMMAND, DOCUMENTS, OWN, ROOT, blocks, parse, train_arguments
+from tests.pages import COMMAND, DOCUMENTS, OWN, ROOT, blocks, parse, runs, train_arguments
 
 README = (ROOT / "README.md").read_text()
 WITH_CODE = [document for document in DOCUMENTS if blocks(document)]
@@ -103,6 +103,7 @@ def test_code_is_python(document):
     [
         pytest.param(document, id=document.name, marks=[pytest.mark.slow] if walks(document) else [])
         for document in WITH_CODE
+        if any(map(runs, blocks(document)))
     ],
 )
 def test_code_runs(document, tmp_path, request):
