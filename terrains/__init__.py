@@ -1,9 +1,11 @@
 """Terrains: generators from difficulty to primitives, and every view of them.
 
-terrain = terrains.make_terrain("poles", "paper", seed=0)     # true geometry, host
-bank = terrains.make_bank("poles", num_terrains=1024, seed=0)  # arrays, device
-terrains.height(bank, k, xy); terrains.contact(bank, k, centre, bank.floor[k])
-terrains.add_to_spec(spec, terrain)                           # MuJoCo geoms
+    terrain = terrains.make_terrain("poles", "paper", seed=0)     # true geometry, host
+    bank = terrains.make_bank("poles", num_terrains=1024, seed=0)  # arrays, device
+    terrains.height(bank, k, xy); terrains.contact(bank, k, centre, bank.floor[k])
+    terrains.add_to_spec(spec, terrain)                           # MuJoCo geoms
+
+A new kind is a function in any file: see `terrains.registry`.
 """
 
 from terrains import generators as _generators  # noqa: F401, registers the built-in kinds

@@ -1,22 +1,20 @@
 """What the documents say can be done, can: commands parse, links and paths lead somewhere, code runs."""
 
-import dataclasses
-import importlib.util
+import ast
+import os
 import re
-import shlex
+import shutil
+import subprocess
+import sys
 import tomllib
-from pathlib import Path
 
 import pytest
 
-from tests.tlq.policies import trained
-from tlq import cli, config
+from tests.pages import COMMAND, DOCUMENTS, OWN, ROOT, blocks, parse, runs, train_arguments
 
-ROOT = Path(__file__).resolve().parents[1]
-DOCUMENTS = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md")])
 README = (ROOT / "README.md").read_text()
+WITH_CODE = [document for document in DOCUMENTS if blocks(document)]
 
-COMMAND = re.compile(r"python (train\.py|-m (?:tlq|benchmarks)\.\w+)((?: +[\w.]+=[^\s`|]+)*)")
 SETTING = re.compile(r"`((?:env|policy|ppo)(?:\.\w+)+)=([^`\s]*)`")
 LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
 PLACE = re.compile(
@@ -30,33 +28,17 @@ def everywhere(pattern):
     return [pytest.param(*groups, id=name) for groups, name in found.items()]
 
 
-def train_arguments(arguments):
-    """Composes a training configuration as train.py does; a run to resume needn't exist here."""
-    from hydra import compose, initialize_config_dir
-
-    config.register()
-    arguments = config.clean([a for a in arguments if not a.startswith("resume=")])
-    with initialize_config_dir(str(ROOT / "tlq" / "conf"), version_base=None):
-        config.from_hydra(compose("train", overrides=arguments), arguments)
-
-
-def filled_in(options, argument):
-    """NAME and the like stand for one of the choices."""
-    key, _, value = argument.partition("=")
-    choices = {field.name: field.metadata["choices"] for field in dataclasses.fields(options)}.get(key)
-    return f"{key}={choices()[0]}" if choices and value.isupper() else argument
-
-
 @pytest.mark.parametrize(("program", "arguments"), everywhere(COMMAND))
 def test_commands_have_settings_that_exist(program, arguments):
-    arguments = shlex.split(arguments)
-    if program == "train.py":
-        train_arguments(arguments)
-    elif program.startswith("-m benchmarks."):
-        assert importlib.util.find_spec(program.split()[1])
-    else:
-        module = importlib.import_module(program.split()[1])
-        cli.parse(module.Options, [filled_in(module.Options, argument) for argument in arguments])
+    parse(program, arguments)
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
+def test_lines_that_start_a_program_are_checked(document):
+    """A command that the pattern above doesn't see wouldn't be."""
+    lines = re.findall(r"^ {4}(?:\w+ )?(python .*)", document.read_text(), flags=re.MULTILINE)
+    known = (COMMAND, OWN, re.compile(r"python -m pytest"))
+    assert [line for line in lines if not any(pattern.match(line) for pattern in known)] == []
 
 
 @pytest.mark.parametrize(("key", "value"), everywhere(SETTING))
@@ -105,11 +87,36 @@ def test_extras_and_versions_are_those_of_the_project():
     assert f"## {project['version']}" in (ROOT / "CHANGELOG.md").read_text()
 
 
-@pytest.mark.slow
-def test_readme_code_runs(tmp_path, monkeypatch):
-    trained().export(tmp_path / "policy.npz")
-    monkeypatch.chdir(tmp_path)
-    blocks = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
-    assert len(blocks) == 2
-    for block in blocks:
-        exec(compile(block, "README.md", "exec"), {})
+def walks(document):
+    """Whether a document's code compiles an environment's step, which takes a minute."""
+    return any(".step)" in block for block in blocks(document))
+
+
+@pytest.mark.parametrize("document", WITH_CODE, ids=lambda path: path.name)
+def test_code_is_python(document):
+    for block in blocks(document):
+        ast.parse(block)
+
+
+@pytest.mark.parametrize(
+    "document",
+    [
+        pytest.param(document, id=document.name, marks=[pytest.mark.slow] if walks(document) else [])
+        for document in WITH_CODE
+        if any(map(runs, blocks(document)))
+    ],
+)
+def test_code_runs(document, tmp_path, request):
+    """In a process of its own: pages register robots and terrains."""
+    shutil.copy(ROOT / "policies" / "blocks.npz", tmp_path / "policy.npz")
+    cache = os.environ.get("JAX_COMPILATION_CACHE_DIR", str(request.config.cache.mkdir("jax")))
+    done = subprocess.run(
+        [sys.executable, "-m", "tests.pages", str(document)],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(ROOT), "JAX_COMPILATION_CACHE_DIR": cache},
+        capture_output=True,
+        text=True,
+        timeout=900,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr

@@ -1,9 +1,11 @@
 """Shows a policy walking in MuJoCo C, on the terrain's true geometry.
 
-python -m tlq.play policy=poles terrain=poles                 # a page for the browser; needs pip install 'tlq[play]'
-python -m tlq.play policy=poles terrain=poles viewer=native   # MuJoCo's viewer; needs a display
-python -m tlq.play policy=poles terrain=poles video=walk.mp4  # a video; needs EGL or OSMesa
-python -m tlq.play policy=poles terrain=poles picture=walk.png  # a strip of moments
+    python -m tlq.play policy=poles terrain=poles                 # a page in the browser; needs pip install 'tlq[play]'
+    python -m tlq.play policy=poles terrain=poles viewer=native   # MuJoCo's viewer; needs a display
+    python -m tlq.play policy=poles terrain=poles video=walk.mp4  # a video; needs EGL or OSMesa
+    python -m tlq.play policy=poles terrain=poles picture=walk.png  # a strip of moments
+
+The same kind, difficulty and seed give the same terrain as in `tlq.evaluate`.
 """
 
 import dataclasses
