@@ -37,6 +37,13 @@ ACROSS = 6.0
 """What a metre costs by which the line between two feet in swing is moved across, from where balance wants it."""
 BEYOND = 10.0
 """What a metre costs by which a foot is led beyond the places that were looked at."""
+HOLD, HELD = 0.5, 0.05
+"""What it costs to lead a foot in stance by HELD (m) from where it was led when it came down; with the distance
+squared. A foot that is let go pushes the trunk by as much as it was led aside."""
+LED = 0.02
+"""Displacement (m) from which on a foot is held altogether."""
+SMOOTHING = 0.3
+"""Share of each step's displacement in the one that is held: actions are noisy while a policy learns."""
 CANDIDATES = 16
 """Places of each foot, the best ones alone, of which the best pair is taken."""
 AWAY = 0.1
@@ -184,11 +191,11 @@ def _target(env: QuadrupedEnv, episode: Episode) -> tuple[jax.Array, jax.Array]:
 class Guidance(NamedTuple):
     """What `cost` reads. Legs and sides are the policy's, mirrored if its observation is."""
 
-    legs: jax.Array
-    """(2,) int32, the feet that it is about."""
     lead: jax.Array
-    """(2, 2, 4) m: residual actions (3,) of a leg move its foot by lead[:, :3] @ residual + lead[:, 3], forwards and
+    """(4, 2, 4) m: residual actions (3,) of a leg move its foot by lead[:, :3] @ residual + lead[:, 3], forwards and
     left. The height is left to the policy."""
+    legs: jax.Array
+    """(2,) int32, the feet in swing that the rest is about, but for the last two."""
     gaps: jax.Array
     """(2, SIDE, SIDE) float16, share of gap at each place."""
     ahead: jax.Array
@@ -197,10 +204,17 @@ class Guidance(NamedTuple):
     """(2,) unit vector across the line between the two steps' ends."""
     weight: jax.Array
     """(2,) how much each foot counts, 0 where it had better be left alone."""
+    held: jax.Array
+    """(4, 2) m, where feet in stance were led when they came down."""
+    hold: jax.Array
+    """(4,) how much that counts, 0 in swing."""
 
 
-def guide(env: QuadrupedEnv, episode: Episode) -> Guidance:
-    """What there is to say about the next action's footholds."""
+def guide(env: QuadrupedEnv, episode: Episode, held: jax.Array) -> Guidance:
+    """What there is to say about the next action's footholds.
+
+    held: (4, 2) m, of `Guided`.
+    """
     s, core = steps(env, episode), env.core
     target, level = _target(env, episode)
     last = episode.controller.actions[0][2:].reshape(4, 3)
@@ -217,56 +231,72 @@ def guide(env: QuadrupedEnv, episode: Episode) -> Guidance:
     moved, *slopes = turned(0)[0], *(turned(joint)[1] for joint in range(3))
     slope = jnp.stack(slopes, axis=-1)
     rest = moved - jnp.einsum("lij,lj->li", slope, last)
-    lead = jnp.concatenate([slope, rest[..., None]], axis=-1)[s.legs]
+    lead = jnp.concatenate([slope, rest[..., None]], axis=-1)
     gaps = s.gaps.reshape(2, SIDE, SIDE).astype(jnp.float16)
     across, weight = _across(s.ends[0] - s.ends[1]), jnp.where(s.asked, s.share, 0.0)
-    mirror = core.update_mirror(episode.controller.mirror, env.heading_command(episode))
+    stance = (tg.path.leg_phases(episode.controller.phase) <= 0) & (
+        jnp.sum(jnp.square(episode.command)) > 0.5
+    )
+    hold = jnp.where(stance, jnp.clip(jnp.linalg.norm(held, axis=-1) / LED, 0.0, 1.0), 0.0)
+    own = Guidance(lead, s.legs.astype(jnp.int32), gaps, s.ahead, across, weight, held, hold)
     # In the mirror left is right, and the abduction joints turn the other way.
-    side = jnp.array([1.0, -1.0])
+    side, swapped = jnp.array([1.0, -1.0]), jnp.array([1, 0, 3, 2], jnp.int32)
     other = Guidance(
-        jnp.array([1, 0, 3, 2], jnp.int32)[s.legs],
-        lead * jnp.asarray([[-1.0, 1.0, 1.0, 1.0], [1.0, -1.0, -1.0, -1.0]]),
+        lead[swapped] * jnp.asarray([[-1.0, 1.0, 1.0, 1.0], [1.0, -1.0, -1.0, -1.0]]),
+        swapped[s.legs],
         gaps[:, :, ::-1],
         s.ahead * side,
         across * side,
         weight,
+        held[swapped] * side,
+        hold[swapped],
     )
-    own = Guidance(s.legs.astype(jnp.int32), lead, gaps, s.ahead, across, weight)
+    mirror = core.update_mirror(episode.controller.mirror, env.heading_command(episode))
     return jax.tree.map(lambda mine, mirrored: jnp.where(mirror > 0, mine, mirrored), own, other)
 
 
 def cost(guidance: Guidance, action: jax.Array) -> jax.Array:
-    """What the footholds cost (...) to which actions (..., 14) lead: gaps, and imbalance.
+    """What the footholds cost (...) to which actions (..., 14) lead: gaps, imbalance, and feet let go.
 
     To be lowered by its slope: of several places an action slides into the nearest. The mean of the best places, which
     imitation ends at where they are ambiguous, may be a gap.
     """
-    residual = action[..., 2:].reshape(*action.shape[:-1], 4, 3)
-    residual = jnp.take_along_axis(residual, guidance.legs[..., None], axis=-2)
-    led = jnp.sum(guidance.lead[..., :3] * residual[..., None, :], axis=-1) + guidance.lead[..., 3]
+    residual = action[..., 2:].reshape(*action.shape[:-1], 4, 1, 3)
+    feet = jnp.sum(guidance.lead[..., :3] * residual, axis=-1) + guidance.lead[..., 3]
+    let_go = jnp.sum(guidance.hold * jnp.sum(jnp.square((feet - guidance.held) / HELD), axis=-1), axis=-1)
+    led = jnp.take_along_axis(feet, guidance.legs[..., None], axis=-2)
     beyond = jnp.sum(jnp.maximum(jnp.abs(led) - REACH * CELL, 0.0), axis=-1)
     off = led - guidance.ahead[..., None, :]
     far = jnp.sqrt(jnp.sum(jnp.square(off), axis=-1) + 1e-6)  # a slope at 0, too
     each = between(guidance.gaps.astype(jnp.float32), led) + FARTHER * far + BEYOND * beyond
     middle = jnp.abs(jnp.sum(jnp.mean(off, axis=-2) * guidance.across, axis=-1))
     both = jnp.min(guidance.weight, axis=-1)
-    return jnp.sum(guidance.weight * each, axis=-1) + both * ACROSS * middle
+    return jnp.sum(guidance.weight * each, axis=-1) + both * ACROSS * middle + HOLD * let_go
 
 
 class Guided(Wrapper):
-    """An environment whose state's info has, as 'guide', the `Guidance` for the next action."""
+    """An environment whose state's info has, as 'guide', the `Guidance` for the next action.
+
+    And, as 'held' (4, 2) m, heading frame, where the feet are led by residual joint angles, smoothed; in stance, where
+    they were led when they came down.
+    """
 
     def __init__(self, env: Env):
         super().__init__(env)
 
-    def _with_guide(self, state: State) -> State:
+    def _with_guide(self, state: State, held: jax.Array) -> State:
         env = cast(QuadrupedEnv, self.env.unwrapped)
-        return state.replace(info=state.info | {"guide": guide(env, state.pipeline_state)})
+        episode: Episode = state.pipeline_state
+        controller = episode.controller
+        now = env.core.residual_displacement(controller, exact_sensors(episode))[:, :2]
+        swing = tg.path.leg_phases(controller.phase)[:, None] > 0
+        held = jnp.where(state.done > 0, 0.0, jnp.where(swing, held + SMOOTHING * (now - held), held))
+        return state.replace(info=state.info | {"guide": guide(env, episode, held), "held": held})
 
     def reset(self, key: jax.Array) -> State:
         """As the environment's."""
-        return self._with_guide(self.env.reset(key))
+        return self._with_guide(self.env.reset(key), jnp.zeros((4, 2)))
 
     def step(self, state: State, action: jax.Array) -> State:
         """As the environment's."""
-        return self._with_guide(self.env.step(state, action))
+        return self._with_guide(self.env.step(state, action), state.info["held"])

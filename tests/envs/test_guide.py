@@ -130,7 +130,7 @@ def test_guidance_is_about_the_policys_own_actions(exact, command, mirror):
     """Legs, sides and what residual actions do are those of the mirror image if the policy sees that."""
     env, k, random = exact.env, exact.find("poles", 9), np.random.default_rng(1)
     core = env.core
-    both = jax.jit(lambda episode: (guide.guide(env, episode), guide.steps(env, episode)))
+    both = jax.jit(lambda episode, held: (guide.guide(env, episode, held), guide.steps(env, episode)))
     asked = 0
     for xy in random.uniform(-1.2, 1.2, (6, 2)):
         episode = walking(exact, k, xy, command, phase=random.uniform(0.0, np.pi), mirror=mirror)
@@ -139,12 +139,12 @@ def test_guidance_is_about_the_policys_own_actions(exact, command, mirror):
         episode = episode.replace(
             controller=controller._replace(actions=controller.actions.at[0].set(jnp.asarray(last)))
         )
-        guidance, steps = jax.tree.map(np.asarray, both(episode))
+        held = random.uniform(-0.03, 0.03, (4, 2)).astype(np.float32)
+        guidance, steps = jax.tree.map(np.asarray, both(episode, held))
         mirrored = core.update_mirror(episode.controller.mirror, env.heading_command(episode))
         side = np.array([1.0, mirrored])
-        np.testing.assert_array_equal(
-            np.array([0, 1, 2, 3] if mirrored > 0 else [1, 0, 3, 2])[steps.legs], guidance.legs
-        )
+        order = np.array([0, 1, 2, 3] if mirrored > 0 else [1, 0, 3, 2])
+        np.testing.assert_array_equal(guidance.legs, order[steps.legs])
         np.testing.assert_allclose(guidance.ahead, steps.ahead * side)
         np.testing.assert_allclose(guidance.across @ (side * (steps.ends[0] - steps.ends[1])), 0, atol=1e-6)
         np.testing.assert_allclose(np.linalg.norm(guidance.across), 1, rtol=1e-5)
@@ -153,10 +153,14 @@ def test_guidance_is_about_the_policys_own_actions(exact, command, mirror):
         np.testing.assert_allclose(gaps.reshape(2, -1), steps.gaps, atol=1e-3)
         still = feet_by_mujoco(exact, episode, np.zeros(14))
         for action, off in ((last, 1e-4), (last + random.uniform(-0.1, 0.1, 14), 2e-3)):
-            moved = (feet_by_mujoco(exact, episode, action) - still)[steps.legs] * side
-            own = np.asarray(core.mirror_action(mirrored, action))[2:].reshape(4, 3)[guidance.legs]
+            moved = (feet_by_mujoco(exact, episode, action) - still)[order] * side
+            own = np.asarray(core.mirror_action(mirrored, action))[2:].reshape(4, 3)
             said = np.einsum("lij,lj->li", guidance.lead[..., :3], own) + guidance.lead[..., 3]
             np.testing.assert_allclose(said, moved, atol=off)
+        np.testing.assert_allclose(guidance.held, held[order] * side)
+        phases = np.asarray(tg.path.leg_phases(episode.controller.phase))[order]
+        weight = np.clip(np.linalg.norm(guidance.held, axis=1) / guide.LED, 0, 1)
+        np.testing.assert_allclose(guidance.hold, np.where(phases > 0, 0, weight), rtol=1e-5)
         asked += steps.asked.sum()
     assert asked > 2
 
@@ -176,10 +180,11 @@ def slow_cost(guidance, action):
     """`guide.cost` of one action, with scipy's interpolation and a loop."""
     axis = np.arange(-guide.REACH, guide.REACH + 1) * guide.CELL
     total, middle = 0.0, np.zeros(2)
-    for lead, gaps, leg, weight in zip(
-        guidance.lead, guidance.gaps, guidance.legs, guidance.weight, strict=True
-    ):
-        led = lead[:, :3] @ action[2 + 3 * leg : 5 + 3 * leg] + lead[:, 3]
+    feet = [lead[:, :3] @ action[2 + 3 * i : 5 + 3 * i] + lead[:, 3] for i, lead in enumerate(guidance.lead)]
+    for foot, held, hold in zip(feet, guidance.held, guidance.hold, strict=True):
+        total += guide.HOLD * hold * sum((foot - held) ** 2) / guide.HELD**2
+    for gaps, leg, weight in zip(guidance.gaps, guidance.legs, guidance.weight, strict=True):
+        led = feet[leg]
         inside = np.clip(led, axis[0], axis[-1])
         gap = interpolate.RegularGridInterpolator((axis, axis), gaps.astype(float))(inside)[0]
         away = np.linalg.norm(led - guidance.ahead)
@@ -193,16 +198,18 @@ def test_cost_against_a_loop():
     for _ in range(50):
         across = random.normal(size=2)
         guidance = guide.Guidance(
+            lead=random.normal(scale=0.08, size=(4, 2, 4)).astype(np.float32),
             legs=random.permutation(4)[:2].astype(np.int32),
-            lead=random.normal(scale=0.08, size=(2, 2, 4)).astype(np.float32),
             gaps=random.uniform(size=(2, guide.SIDE, guide.SIDE)).astype(np.float16),
             ahead=random.uniform(-0.1, 0.1, 2).astype(np.float32),
             across=(across / np.linalg.norm(across)).astype(np.float32),
             weight=random.uniform(0, 1, 2).astype(np.float32),
+            held=random.normal(scale=0.05, size=(4, 2)).astype(np.float32),
+            hold=random.uniform(0, 1, 4).astype(np.float32),
         )
         action = random.uniform(-1, 1, 14).astype(np.float32)
         found = guide.cost(jax.tree.map(jnp.asarray, guidance), jnp.asarray(action))
-        np.testing.assert_allclose(found, slow_cost(guidance, action), atol=0.005)
+        np.testing.assert_allclose(found, slow_cost(guidance, action), rtol=1e-4, atol=0.005)
 
 
 def test_its_slope_leads_feet_off_the_gaps(exact):
@@ -211,11 +218,13 @@ def test_its_slope_leads_feet_off_the_gaps(exact):
 
     @jax.jit
     def descended(episode):
-        guidance = guide.guide(env, episode)
+        guidance = guide.guide(env, episode, jnp.zeros((4, 2)))
 
         def gap(action):
-            own = action[2:].reshape(4, 3)[guidance.legs]
-            led = jnp.einsum("lij,lj->li", guidance.lead[..., :3], own) + guidance.lead[..., 3]
+            own = action[2:].reshape(4, 3)
+            led = (jnp.einsum("lij,lj->li", guidance.lead[..., :3], own) + guidance.lead[..., 3])[
+                guidance.legs
+            ]
             return guide.between(guidance.gaps.astype(jnp.float32), led) * (guidance.weight > 0.9)
 
         slope = jax.grad(lambda action: guide.cost(guidance, action))
@@ -237,12 +246,19 @@ def test_only_terrain_with_gaps_has_pits(exact):
     assert not envs.make(envs.EnvConfig(terrain=flat)).has_pits
 
 
-def test_a_guided_environment_adds_what_the_guide_asks_for(exact):
+def test_a_guided_environment_adds_what_the_guide_says(exact):
     env = envs.Guided(exact.auto)
     state = jax.jit(env.reset)(jax.random.key(0))
-    after = jax.jit(env.step)(state, jnp.zeros(14))
-    alone = jax.jit(lambda episode: guide.guide(exact.env, episode))
+    after = jax.jit(env.step)(state, 0.5 * jnp.ones(14))
+    controller = after.pipeline_state.controller
+    now = exact.env.core.residual_displacement(controller, exact_sensors(after.pipeline_state))[:, :2]
+    swing = np.asarray(tg.path.leg_phases(controller.phase))[:, None] > 0
+    before = np.asarray(state.info["held"])
+    held = np.where(swing, before + guide.SMOOTHING * (np.asarray(now) - before), before)
+    np.testing.assert_allclose(after.info["held"], held, atol=1e-5)
+    alone = jax.jit(lambda episode: guide.guide(exact.env, episode, after.info["held"]))
     for added, own in zip(after.info["guide"], alone(after.pipeline_state), strict=True):
         np.testing.assert_allclose(added, own, atol=1e-6)
-    standing_still = change_episode(after.pipeline_state, command=np.zeros(2))
-    np.testing.assert_array_equal(alone(standing_still).weight, 0)
+    standing_still = alone(change_episode(after.pipeline_state, command=np.zeros(2)))
+    np.testing.assert_array_equal(standing_still.weight, 0)
+    np.testing.assert_array_equal(standing_still.hold, 0)

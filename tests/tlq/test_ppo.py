@@ -157,17 +157,19 @@ def test_a_task_that_needs_the_memory(memory, solves):
 
 
 class Asking(Wrapper):
-    """Says that the ground under two legs slopes down to one side, whatever the state."""
+    """Says that there is more gap to one side of two feet, and that a third stands, whatever the state."""
 
     def _ask(self, state):
         slope = jnp.linspace(0.0, 1.0, guide.SIDE)
         guidance = guide.Guidance(
+            lead=jnp.zeros((4, 2, 4)).at[:, 0, 0].set(0.1).at[:, 1, 1].set(0.1),
             legs=jnp.array([1, 2]),
-            lead=jnp.zeros((2, 2, 4)).at[:, 0, 0].set(0.1).at[:, 1, 1].set(0.1),
             gaps=jnp.stack([jnp.tile(slope, (guide.SIDE, 1)), jnp.tile(1 - slope, (guide.SIDE, 1))]),
             ahead=jnp.zeros(2),
             across=jnp.array([0.0, 1.0]),
             weight=jnp.ones(2),
+            held=jnp.array([[0.05, 0.0]] * 4),
+            hold=jnp.array([1.0, 0.0, 0.0, 0.0]),
         )
         return state.replace(info=state.info | {"guide": guidance})
 
@@ -190,7 +192,8 @@ def test_a_policy_learns_where_its_guide_sees_ground():
         state.normaliser, state.params.policy, state.env_state.obs
     )
     residual = np.tanh(parameters["action"][:, :14])[:, 2:].reshape(-1, 4, 3).mean(axis=0)
-    # Down the slope, one leg to the right, the other to the left, so that the middle stays.
+    # One foot to the right, another to the left, so that the middle stays; the third where it was.
     assert residual[1, 1] < -0.5
     assert residual[2, 1] > 0.5
+    np.testing.assert_allclose(residual[0, :2], [0.5, 0.0], atol=0.1)
     assert losses[-1] < 0.6 * losses[0]
