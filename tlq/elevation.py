@@ -24,10 +24,10 @@ import numpy as np
 class ElevationConfig:
     """Sizes and thresholds of an elevation map."""
 
-    cell: float = 0.02
+    cell: float = 0.015
     """Side of a cell (m)."""
     cells: int = 128
-    """N, cells along a side, even: with 2 cm the map reaches 1.28 m to every side."""
+    """N, cells along a side, even: with 1.5 cm the map reaches 0.96 m to every side."""
     least_deviation: float = 0.004
     """Standard deviation (m) below which no height is trusted, however often it was measured."""
     gate: float = 3.0
@@ -50,6 +50,14 @@ class ElevationConfig:
     """Cells before a ray's end over which it is taken to pass."""
     rings: tuple[int, ...] = (1, 2, 3, 5, 8)
     """Half widths (cells) of the squares in which a cell that isn't measured looks for cells that tell of the ground."""
+    beside: int = 4
+    """Half width (cells) of the square whose highest cell a hole is compared with."""
+    step: float = 0.03
+    """A cell is a hole if it lies at least so far below that (m)..."""
+    floor: int = 3
+    """...and isn't floor: fewer than so many of its eight neighbours were measured at its height."""
+    hole: float = 0.3
+    """Depth (m) of a hole whose floor isn't seen. Deeper than what the policy tells apart, 0.25 m."""
 
 
 class ElevationMap:
@@ -162,7 +170,8 @@ class ElevationMap:
         inside = self.inside(cells)
         where = self.index(cells)
         found = np.where(inside, self.height[where], self.ground)
-        missing = np.flatnonzero(inside & (self.bound[where] | np.isinf(self.variance[where])))
+        found, hole = self._holes(cells, found)
+        missing = np.flatnonzero(inside & ~hole & (self.bound[where] | np.isinf(self.variance[where])))
         for ring in self.config.rings:
             if not len(missing):
                 break
@@ -174,6 +183,27 @@ class ElevationMap:
         return found.reshape(places.shape[:-1])
 
     # -- parts of it
+
+    def _holes(self, cells: np.ndarray, heights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Heights (C,) m of cells (C, 2), deepened where they are holes, and which are (C,).
+
+        From the side only a hole's upper part is seen, walls or rays that pass into it; how far down depends on where the
+        robot looks from, not on the ground.
+        """
+        c = self.config
+        offset = np.arange(-c.beside, c.beside + 1)
+        steps = np.stack(np.meshgrid(offset, offset), axis=-1).reshape(-1, 2)
+        around = cells[:, None] + steps
+        where = self.index(around)
+        measured = self.inside(around) & np.isfinite(self.variance[where]) & ~self.bound[where]
+        high = np.where(measured, self.height[where], -np.inf).max(axis=1)
+        next_to = np.abs(steps).max(axis=1) == 1
+        level = np.abs(self.height[where[:, next_to]] - heights[:, None]) < c.least_gate
+        floor = (measured[:, next_to] & level).sum(axis=1) >= c.floor
+        own = self.index(cells)
+        known = self.inside(cells) & np.isfinite(self.variance[own])
+        hole = known & (heights < high - c.step) & (self.bound[own] | ~floor)
+        return np.where(hole, np.minimum(heights, high - c.hole), heights), hole
 
     def _lowest(self, cells: np.ndarray, ring: int) -> np.ndarray:
         """The lowest height (C,) m known within `ring` cells of cells (C, 2); infinite if none is measured."""

@@ -15,7 +15,7 @@ import numpy as np
 import tg
 
 SENSORS = ("lidar", "depth")
-FARTHEST = 1.2
+FARTHEST = 1.0
 """Rays end after so many metres: beyond, nothing is read from the map."""
 
 
@@ -31,8 +31,8 @@ class LidarConfig:
     """Shortest range (m)."""
     deviation: float = 0.02
     """Standard deviation of the range (m); the manufacturer's at 10 m."""
-    rays: int = 560
-    """Points a control step. Assumed: the sensor gives 4,000; a seventh of them is enough, and is what time allows here.
+    rays: int = 640
+    """Points a control step. Assumed: the sensor gives 4,000; a sixth of them is enough, and is what time allows here.
     Taken from an even sequence (Roberts' R2) in place of the manufacturer's rosette; those that can't end on the ground near
     the robot aren't cast."""
     pitch: float = math.radians(35.0)
@@ -145,7 +145,7 @@ class RangeSensors:
 
     def _cast(self, model, data, mount: Mount, rays, deviation, nearest, random) -> Scan:
         rotation, trunk = data.xmat[self.trunk].reshape(3, 3), data.xpos[self.trunk]
-        down = (rays @ rotation.T)[:, 2] < -0.2  # flatter ones end beyond FARTHEST
+        down = (rays @ rotation.T)[:, 2] < -0.3  # flatter ones end beyond FARTHEST
         rays, deviation, nearest = rays[down], deviation[down], nearest[down]
         count = len(rays)
         geoms, ranges = np.full(count, -1, np.int32), np.full(count, -1.0)
