@@ -24,21 +24,17 @@ import numpy as np
 class ElevationConfig:
     """Sizes and thresholds of an elevation map."""
 
-    cell: float = 0.015
+    cell: float = 0.02
     """Side of a cell (m)."""
     cells: int = 128
-    """N, cells along a side, even: with 1.5 cm the map reaches 0.96 m to every side."""
+    """N, cells along a side, even: with 2 cm the map reaches 1.28 m to every side."""
     least_deviation: float = 0.004
     """Standard deviation (m) below which no height is trusted, however often it was measured."""
     gate: float = 3.0
     """A measurement agrees with a cell when it is within so many standard deviations of both together..."""
     least_gate: float = 0.015
-    """...or within this (m)."""
-    doubt: float = 0.018
-    """A scan that contradicts a cell adds the square of this (m) to the cell's variance..."""
-    forget: float = 0.03
-    """...and a cell with a larger standard deviation than this (m) takes over what the scan says: after three
-    contradictions, fewer where it is old, more where others agree with it."""
+    """...or within this (m). One that doesn't agree takes the cell's place: with a pose that drifts, what was seen last is
+    nearest to the truth."""
     bound_deviation: float = 0.02
     """Standard deviation (m) of a bound by one scan."""
     drift: float = 0.01
@@ -155,23 +151,19 @@ class ElevationMap:
         where, measured, spread = self._tops(points, variance)
         self._follow(where, measured)
         low = self._passes(np.broadcast_to(origin, points.shape), points)
-        agreed = self._measure(where, measured, spread)
-        low[agreed] = np.inf  # what is seen there counts for more than what is seen beside it in the same cell
+        low[where] = np.inf  # what is seen in a cell counts for more than rays that miss it
+        self._measure(where, measured, spread)
         passed = np.flatnonzero(low < np.inf)
         self._pass(passed, low[passed])
 
     def read(self, places: np.ndarray) -> np.ndarray:
-        """Heights (...) m at places (..., 2) m: of the cell, or filled in from around it.
+        """Heights (...) m at places (..., 2) m: of the cell and those beside it that agree, or filled in from around it.
 
-        A cell that isn't measured, as it is hidden from all sides or a gap, is taken to be as low as the lowest that is
-        known in the smallest square round it in which anything is; what is hidden is hidden by something higher.
+        A cell that isn't measured is taken to be as low as the lowest that is known in the smallest square round it in
+        which anything is: what is hidden is hidden by something higher. A hole is taken to be deep.
         """
         cells = self.cells_of(np.asarray(places, float)).reshape(-1, 2)
-        inside = self.inside(cells)
-        where = self.index(cells)
-        found = np.where(inside, self.height[where], self.ground)
-        found, hole = self._holes(cells, found)
-        missing = np.flatnonzero(inside & ~hole & (self.bound[where] | np.isinf(self.variance[where])))
+        found, missing = self._seen(cells)
         for ring in self.config.rings:
             if not len(missing):
                 break
@@ -184,26 +176,35 @@ class ElevationMap:
 
     # -- parts of it
 
-    def _holes(self, cells: np.ndarray, heights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Heights (C,) m of cells (C, 2), deepened where they are holes, and which are (C,).
+    def _seen(self, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Heights (C,) m of cells (C, 2), and the numbers of those that were not seen and are no holes.
 
-        From the side only a hole's upper part is seen, walls or rays that pass into it; how far down depends on where the
-        robot looks from, not on the ground.
+        From the side only a hole's upper part is seen: its walls, or rays that pass into it. How far down depends on where
+        the robot looks from, not on the ground.
         """
-        c = self.config
+        c, own = self.config, self.index(cells)
         offset = np.arange(-c.beside, c.beside + 1)
         steps = np.stack(np.meshgrid(offset, offset), axis=-1).reshape(-1, 2)
         around = cells[:, None] + steps
         where = self.index(around)
-        measured = self.inside(around) & np.isfinite(self.variance[where]) & ~self.bound[where]
-        high = np.where(measured, self.height[where], -np.inf).max(axis=1)
-        next_to = np.abs(steps).max(axis=1) == 1
-        level = np.abs(self.height[where[:, next_to]] - heights[:, None]) < c.least_gate
-        floor = (measured[:, next_to] & level).sum(axis=1) >= c.floor
-        own = self.index(cells)
-        known = self.inside(cells) & np.isfinite(self.variance[own])
-        hole = known & (heights < high - c.step) & (self.bound[own] | ~floor)
-        return np.where(hole, np.minimum(heights, high - c.hole), heights), hole
+        height, variance = self.height[where], self.variance[where]
+        measured = self.inside(around) & np.isfinite(variance) & ~self.bound[where]
+        error = np.sqrt(np.where(measured, variance, 0.0))
+        here, known = self.height[own], self.inside(cells) & np.isfinite(self.variance[own])
+        doubt = np.sqrt(np.where(known, self.variance[own], 0.0))
+
+        near = np.abs(steps).max(axis=1) <= 1
+        level = np.abs(height[:, near] - here[:, None]) <= np.maximum(np.hypot(error[:, near], doubt[:, None]), c.least_gate)
+        level &= measured[:, near]
+        surely = np.where(measured, height - error, -np.inf).max(axis=1)
+        surface = known & ~self.bound[own]
+        floor = surface & (level.sum(axis=1) > c.floor)  # itself is one of them
+        hole = known & ~floor & (here < surely - c.step)
+
+        weight = np.where(level, 1.0 / np.where(level, variance[:, near], 1.0), 0.0)
+        mean = (weight * height[:, near]).sum(axis=1) / np.maximum(weight.sum(axis=1), 1e-9)
+        found = np.where(hole, np.minimum(here, surely - c.hole), np.where(surface, mean, here))
+        return found, np.flatnonzero(~surface & ~hole)
 
     def _lowest(self, cells: np.ndarray, ring: int) -> np.ndarray:
         """The lowest height (C,) m known within `ring` cells of cells (C, 2); infinite if none is measured."""
@@ -255,35 +256,25 @@ class ElevationMap:
         np.minimum.at(low, self.index(cells[keep]), on[keep][:, 2])
         return low
 
-    def _measure(self, where: np.ndarray, measured: np.ndarray, spread: np.ndarray) -> np.ndarray:
-        """Kalman updates of cells (C,) by heights (C,) m with variances (C,) m²; those that agreed, or were new."""
+    def _measure(self, where: np.ndarray, measured: np.ndarray, spread: np.ndarray) -> None:
+        """Kalman updates of cells (C,) by heights (C,) m with variances (C,) m²."""
         c = self.config
-        height, variance, bound = self.height[where], self.variance[where], self.bound[where]
-        gate = np.maximum(c.gate * np.sqrt(variance + spread), c.least_gate)
-        above = measured - height
-        fresh = np.isinf(variance) | (bound & (above <= gate))
-        agree = ~fresh & ~bound & (np.abs(above) <= gate)
-        doubted = variance + c.doubt**2
-        taken = fresh | (~agree & (doubted > c.forget**2))
-        gain = np.where(agree, variance / np.where(agree, variance + spread, 1.0), 0.0)
-        self.height[where] = np.where(taken, measured, height + np.where(agree, gain * above, 0.0))
-        kept = np.where(agree, np.maximum((1.0 - gain) * np.where(agree, variance, 0.0), c.least_deviation**2), doubted)
-        self.variance[where] = np.where(taken, spread, kept)
-        self.bound[where] = bound & ~taken
-        return where[taken | agree]
+        height, variance = self.height[where], self.variance[where]
+        known = np.isfinite(variance) & ~self.bound[where]
+        prior = np.where(known, variance, 1.0)
+        agree = known & (np.abs(measured - height) <= np.maximum(c.gate * np.sqrt(prior + spread), c.least_gate))
+        gain = np.where(agree, prior / (prior + spread), 1.0)
+        self.height[where] = np.where(agree, height + gain * (measured - height), measured)
+        self.variance[where] = np.maximum(np.where(agree, (1.0 - gain) * prior, spread), c.least_deviation**2)
+        self.bound[where] = False
 
     def _pass(self, where: np.ndarray, low: np.ndarray) -> None:
         """Cells (C,) over which rays passed at heights (C,) m, and in which nothing was seen."""
         c = self.config
         height, variance, bound = self.height[where], self.variance[where], self.bound[where]
         new = np.isinf(variance)
-        below = height - low
-        against = ~new & ~bound & (below > np.maximum(c.gate * np.sqrt(np.where(new, 0.0, variance)), c.least_gate))
-        doubted = variance + np.where(against, c.doubt**2, 0.0)
-        taken = new | (against & (doubted > c.forget**2))
-        one = c.bound_deviation**2
-        firmer = np.maximum(1.0 / (1.0 / np.where(bound, doubted, one) + 1.0 / one), c.least_deviation**2)
-        lower = taken | (bound & (below > 0.0))
-        self.height[where] = np.where(lower, low, height)
-        self.variance[where] = np.where(taken, one, np.where(bound, firmer, doubted))
+        gate = np.maximum(c.gate * np.sqrt(np.where(new, 0.0, variance)), c.least_gate)
+        taken = new | (height - low > np.where(bound, 0.0, gate))
+        self.height[where] = np.where(taken, low, height)
+        self.variance[where] = np.where(taken | bound, c.bound_deviation**2, variance)
         self.bound[where] = bound | taken
