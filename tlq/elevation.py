@@ -33,8 +33,13 @@ class ElevationConfig:
     gate: float = 3.0
     """A measurement agrees with a cell when it is within so many standard deviations of both together..."""
     least_gate: float = 0.015
-    """...or within this (m). One that doesn't agree takes the cell's place: with a pose that drifts, what was seen last is
-    nearest to the truth."""
+    """...or within this (m). One that doesn't takes the cell's place if it is higher, and rays that pass below do at once:
+    with a pose that drifts, what was seen last is nearest to the truth..."""
+    doubt: float = 0.018
+    """...but one that is lower may be the side of a step in the same cell: it adds the square of this (m) to the cell's
+    variance..."""
+    forget: float = 0.03
+    """...and takes its place when the standard deviation would go beyond this (m): the third in a row."""
     bound_deviation: float = 0.02
     """Standard deviation (m) of a bound by one scan."""
     drift: float = 0.01
@@ -167,9 +172,8 @@ class ElevationMap:
         for ring in self.config.rings:
             if not len(missing):
                 break
-            lowest = self._lowest(cells[missing], ring)
-            done = np.isfinite(lowest)
-            found[missing[done]] = lowest[done]
+            lowest, done = self._lowest(cells[missing], ring)
+            found[missing[done]] = self._seen(lowest[done])[0]
             missing = missing[~done]
         found[missing] = self.ground
         return found.reshape(places.shape[:-1])
@@ -206,15 +210,15 @@ class ElevationMap:
         found = np.where(hole, np.minimum(here, surely - c.hole), np.where(surface, mean, here))
         return found, np.flatnonzero(~surface & ~hole)
 
-    def _lowest(self, cells: np.ndarray, ring: int) -> np.ndarray:
-        """The lowest height (C,) m known within `ring` cells of cells (C, 2); infinite if none is measured."""
+    def _lowest(self, cells: np.ndarray, ring: int) -> tuple[np.ndarray, np.ndarray]:
+        """The lowest known cell (C, 2) within `ring` cells of cells (C, 2), and whether any is measured there (C,)."""
         offset = np.arange(-ring, ring + 1)
         around = cells[:, None] + np.stack(np.meshgrid(offset, offset), axis=-1).reshape(-1, 2)
         where = self.index(around)
         known = self.inside(around) & np.isfinite(self.variance[where])
-        lowest = np.where(known, self.height[where], np.inf).min(axis=1)
+        lowest = np.where(known, self.height[where], np.inf).argmin(axis=1)
         # Bounds alone don't tell of the ground: a ray may pass high over all of them.
-        return np.where((known & ~self.bound[where]).any(axis=1), lowest, np.inf)
+        return around[np.arange(len(cells)), lowest], (known & ~self.bound[where]).any(axis=1)
 
     def _tops(self, points: np.ndarray, variance: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """What a scan says of the cells it hit: their place (C,), height (C,) m and variance (C,) m².
@@ -263,9 +267,13 @@ class ElevationMap:
         known = np.isfinite(variance) & ~self.bound[where]
         prior = np.where(known, variance, 1.0)
         agree = known & (np.abs(measured - height) <= np.maximum(c.gate * np.sqrt(prior + spread), c.least_gate))
+        doubted = prior + c.doubt**2
+        keep = known & ~agree & (measured < height) & (doubted < c.forget**2)
         gain = np.where(agree, prior / (prior + spread), 1.0)
-        self.height[where] = np.where(agree, height + gain * (measured - height), measured)
-        self.variance[where] = np.maximum(np.where(agree, (1.0 - gain) * prior, spread), c.least_deviation**2)
+        new = np.where(agree, height + gain * (measured - height), measured)
+        left = np.maximum(np.where(agree, (1.0 - gain) * prior, spread), c.least_deviation**2)
+        self.height[where] = np.where(keep, height, new)
+        self.variance[where] = np.where(keep, doubted, left)
         self.bound[where] = False
 
     def _pass(self, where: np.ndarray, low: np.ndarray) -> None:
