@@ -29,9 +29,9 @@ from tlq.simulation import Simulation
 
 VALUES = {
     "drift": (0.0, 0.02, 0.05, 0.1),
-    "latency": (0.0, 0.05, 0.2, 0.5),
-    "missing": (0.0, 0.05, 0.4, 0.8),
-    "range_noise": (0.0, 1.0, 2.0, 4.0),
+    "latency": (0.05, 0.2, 0.5),
+    "missing": (0.05, 0.4, 0.8),
+    "range_noise": (0.0, 1.0, 3.0),
 }
 """What is varied."""
 LABELS = {
@@ -189,9 +189,7 @@ def compare(sim: Simulation, fit: bool) -> tuple[np.ndarray, np.ndarray, np.ndar
 
 def height(sim: Simulation, points: np.ndarray) -> np.ndarray:
     """True height (...) m in the world at points (..., 2) m of the heading frame."""
-    return terrains.exact_height(
-        sim.terrain, sim.data.qpos[:2] + tg.frames.turn(np.asarray(sim.yaw), points)
-    )
+    return terrains.exact_height(sim.terrain, sim.data.qpos[:2] + tg.frames.turn(np.asarray(sim.yaw), points))
 
 
 def best_shift(seen: np.ndarray, moved: np.ndarray, moves: np.ndarray) -> np.ndarray:

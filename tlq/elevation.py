@@ -32,7 +32,7 @@ class ElevationConfig:
     """Standard deviation (m) below which no height is trusted, however often it was measured."""
     gate: float = 3.0
     """A measurement agrees with a cell when it is within so many standard deviations of both together..."""
-    least_gate: float = 0.015
+    least_gate: float = 0.02
     """...or within this (m). One that doesn't takes the cell's place if it is higher, and rays that pass below do at once:
     with a pose that drifts, what was seen last is nearest to the truth..."""
     doubt: float = 0.018
@@ -53,10 +53,10 @@ class ElevationConfig:
     """Half widths (cells) of the squares in which a cell that isn't measured looks for cells that tell of the ground."""
     beside: int = 4
     """Half width (cells) of the square whose highest cell a hole is compared with."""
-    step: float = 0.03
+    step: float = 0.04
     """A cell is a hole if it lies at least so far below that (m)..."""
-    floor: int = 3
-    """...and isn't floor: fewer than so many of its eight neighbours were measured at its height."""
+    floor: float = 1 / 3
+    """...and isn't floor: no more than this share of it and its neighbours, those that are measured, lie at its height."""
     hole: float = 0.3
     """Depth (m) of a hole whose floor isn't seen. Deeper than what the policy tells apart, 0.25 m."""
 
@@ -69,7 +69,9 @@ class ElevationMap:
         self.config = ElevationConfig() if config is None else config
         c = self.config
         if c.cells < 2 or c.cells % 2 or c.cell <= 0:
-            raise ValueError(f"cells={c.cells}, cell={c.cell}; choose an even number of cells of more than 0 m")
+            raise ValueError(
+                f"cells={c.cells}, cell={c.cell}; choose an even number of cells of more than 0 m"
+            )
         size = c.cells * c.cells
         self.height = np.zeros(size)
         """(N·N,) m, see `index`; means nothing where the variance is infinite."""
@@ -198,11 +200,13 @@ class ElevationMap:
         doubt = np.sqrt(np.where(known, self.variance[own], 0.0))
 
         near = np.abs(steps).max(axis=1) <= 1
-        level = np.abs(height[:, near] - here[:, None]) <= np.maximum(np.hypot(error[:, near], doubt[:, None]), c.least_gate)
+        level = np.abs(height[:, near] - here[:, None]) <= np.maximum(
+            np.hypot(error[:, near], doubt[:, None]), c.least_gate
+        )
         level &= measured[:, near]
         surely = np.where(measured, height - error, -np.inf).max(axis=1)
         surface = known & ~self.bound[own]
-        floor = surface & (level.sum(axis=1) > c.floor)  # itself is one of them
+        floor = surface & (level.sum(axis=1) > c.floor * measured[:, near].sum(axis=1))
         hole = known & ~floor & (here < surely - c.step)
 
         weight = np.where(level, 1.0 / np.where(level, variance[:, near], 1.0), 0.0)
@@ -266,7 +270,9 @@ class ElevationMap:
         height, variance = self.height[where], self.variance[where]
         known = np.isfinite(variance) & ~self.bound[where]
         prior = np.where(known, variance, 1.0)
-        agree = known & (np.abs(measured - height) <= np.maximum(c.gate * np.sqrt(prior + spread), c.least_gate))
+        agree = known & (
+            np.abs(measured - height) <= np.maximum(c.gate * np.sqrt(prior + spread), c.least_gate)
+        )
         doubted = prior + c.doubt**2
         keep = known & ~agree & (measured < height) & (doubted < c.forget**2)
         gain = np.where(agree, prior / (prior + spread), 1.0)

@@ -113,10 +113,14 @@ def _check_perception(options: Options) -> None:
         default = Options()
         for name in ("drift", "latency", "missing", "range_noise"):
             if getattr(options, name) != getattr(default, name):
-                raise ValueError(f"{name}={getattr(options, name)} needs perception=lidar or perception=depth")
+                raise ValueError(
+                    f"{name}={getattr(options, name)} needs perception=lidar or perception=depth"
+                )
         return
     if options.engine != "mujoco":
-        raise ValueError(f"perception={options.perception} needs engine=mujoco; engine=mjx has no range sensors")
+        raise ValueError(
+            f"perception={options.perception} needs engine=mujoco; engine=mjx has no range sensors"
+        )
     sensing.check()
 
 

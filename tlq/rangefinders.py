@@ -73,7 +73,9 @@ class Mount(NamedTuple):
     def rotation(self) -> np.ndarray:
         """(3, 3), trunk from sensor."""
         cy, sy, cp, sp = math.cos(self.yaw), math.sin(self.yaw), math.cos(self.pitch), math.sin(self.pitch)
-        return np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]]) @ np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
+        return np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]]) @ np.array(
+            [[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]]
+        )
 
 
 class Scan(NamedTuple):
@@ -90,7 +92,9 @@ class Scan(NamedTuple):
 class RangeSensors:
     """All the range sensors of one kind on a robot."""
 
-    def __init__(self, kind: str, model: mujoco.MjModel, hips: np.ndarray, *, noise: float = 1.0, missing: float = 0.0):
+    def __init__(
+        self, kind: str, model: mujoco.MjModel, hips: np.ndarray, *, noise: float = 1.0, missing: float = 0.0
+    ):
         """Puts sensors on the trunk.
 
         Args:
@@ -107,6 +111,7 @@ class RangeSensors:
         self.trunk = model.body("trunk").id
         own = model.body_rootid == model.body_rootid[self.trunk]
         self._own = own[model.geom_bodyid]
+        self._floors = np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE)
         self.mounts = mounts(kind, hips, self.lidar.pitch if kind == "lidar" else self.depth.pitch)
         self.reset()
 
@@ -135,7 +140,9 @@ class RangeSensors:
             return rays, np.full(c.rays, c.deviation), np.full(c.rays, c.nearest)
         d = self.depth
         right, down = np.meshgrid(np.arange(d.columns), np.arange(d.rows))
-        place = [(x + random.random(x.shape)) / n * 2.0 - 1.0 for x, n in ((right, d.columns), (down, d.rows))]
+        place = [
+            (x + random.random(x.shape)) / n * 2.0 - 1.0 for x, n in ((right, d.columns), (down, d.rows))
+        ]
         across, below = math.tan(d.width / 2) * place[0].ravel(), math.tan(d.height / 2) * place[1].ravel()
         rays = np.stack([np.ones_like(across), -across, -below], axis=-1)
         length = np.linalg.norm(rays, axis=-1)  # range over depth
@@ -154,6 +161,11 @@ class RangeSensors:
         mujoco.mj_multiRay(
             model, data, origin, world.reshape(-1), None, True, -1, geoms, ranges, None, count, FARTHEST
         )
+        # A plane whose middle is beyond the cutoff is left out there; the ground's are level.
+        for floor in self._floors:
+            below = (data.geom_xpos[floor, 2] - origin[2]) / world[:, 2]
+            nearer = (below > 0.0) & ((ranges < 0.0) | (below < ranges))
+            ranges[nearer], geoms[nearer] = below[nearer], floor
         power = 2 if self.kind == "depth" else 0
         deviation = deviation * np.maximum(ranges, 0.0) ** power
         seen = ranges + self.noise * deviation * random.standard_normal(count)
@@ -177,7 +189,9 @@ def mounts(kind: str, hips: np.ndarray, pitch: float) -> tuple[Mount, ...]:
     return (ends[0], sides[0], ends[1], sides[1])
 
 
-def in_frame(scan: Scan, position: np.ndarray, orientation: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def in_frame(
+    scan: Scan, position: np.ndarray, orientation: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """A scan in the frame of a pose: origins (M, 3) m, points (M, 3) m, variance (M,) m² of the points' heights.
 
     position: (3,) m, of the trunk; orientation: (4,) unit quaternion w, x, y, z, frame from trunk.

@@ -227,7 +227,9 @@ def test_a_step_down_is_no_hole():
 
     for seed in range(3):
         look(ground, step, [0.1, 0.0, 0.4], seed=seed)
-    np.testing.assert_allclose(line(ground, np.array([0.1, 0.17, 0.33, 0.41])), [0, 0, -0.12, -0.12], atol=2e-3)
+    np.testing.assert_allclose(
+        line(ground, np.array([0.1, 0.17, 0.33, 0.41])), [0, 0, -0.12, -0.12], atol=2e-3
+    )
 
 
 def test_a_pole_that_is_no_longer_there_is_forgotten():
