@@ -3,9 +3,9 @@
     python -m benchmarks.perception policy=poles terrain=poles difficulty=0.3 json=FILE picture=FILE.png
     python -m benchmarks.perception policy=blocks terrain=blocks sweep=none
 
-Distances are those of `tlq.evaluate`, in MuJoCo C, one source of error varied at a time and the others at their defaults
-(`tlq.perception.PerceptionConfig`). Errors of heights are taken while the policy walks by them. Then the three numbers of
-training's noise (`envs.RandomisationConfig`) are fitted to them.
+Distances are those of `tlq.evaluate`, in MuJoCo C, one source of error varied at a time and the others at their
+defaults (`tlq.perception.PerceptionConfig`). Errors of heights are taken while the policy walks by them. Then the three
+numbers of training's noise (`envs.RandomisationConfig`) are fitted to them.
 """
 
 import dataclasses
@@ -202,9 +202,9 @@ def best_shift(seen: np.ndarray, moved: np.ndarray, moves: np.ndarray) -> np.nda
 def fitted(errors: Errors) -> dict[str, float]:
     """Training's noise with the same spread: `height_noise`, `height_drift` and `map_drift` of `RandomisationConfig`.
 
-    Training adds to the heights of an episode one offset that is uniform in ± `height_drift`, moves the map by one that is
-    uniform in ± `map_drift` in x and in y, and adds normal noise of deviation `height_noise` to each height of each step. A
-    uniform number in ± a has the deviation a / √3.
+    Training adds to the heights of an episode one offset that is uniform in ± `height_drift`, moves the map by one that
+    is uniform in ± `map_drift` in x and in y, and adds normal noise of deviation `height_noise` to each height of each
+    step. A uniform number in ± a has the deviation a / √3.
     """
     good = ~errors.edge & (np.abs(errors.error) < OUTLIER)
     offset = np.array([np.mean(e[g]) if g.any() else np.nan for e, g in zip(errors.error, good, strict=True)])

@@ -6,13 +6,14 @@
     ground.fuse(origin, points, variance)     # whenever a scan has come
     heights = ground.read(places)
 
-All in one level frame that the pose estimate lives in (odometry), z up, m; only differences within it matter. The grid is
-fixed to that frame and rolls under the robot: cell (i, j) of the frame is kept at (i mod N, j mod N), so moving copies
-nothing. N: cells along a side, M: points of a scan.
+All in one level frame that the pose estimate lives in (odometry), z up, m; only differences within it matter. The grid
+is fixed to that frame and rolls under the robot: cell (i, j) of the frame is kept at (i mod N, j mod N), so moving
+copies nothing. N: cells along a side, M: points of a scan.
 
-A cell holds a height, its variance, and whether the height was *measured* or is a *bound*: where rays pass over a cell and
-hit nothing in it, the ground lies below them. That is how a gap between poles shows, whose bottom is hardly ever seen.
-After Fankhauser et al., Robot-Centric Elevation Mapping with Uncertainty Estimates (CLAWAR 2014), whose map has no bounds.
+A cell holds a height, its variance, and whether the height was *measured* or is a *bound*: where rays pass over a cell
+and hit nothing in it, the ground lies below them. That is how a gap between poles shows, whose bottom is hardly ever
+seen. After Fankhauser et al., Robot-Centric Elevation Mapping with Uncertainty Estimates (CLAWAR 2014), whose map has
+no bounds.
 """
 
 import dataclasses
@@ -33,8 +34,8 @@ class ElevationConfig:
     gate: float = 3.0
     """A measurement agrees with a cell when it is within so many standard deviations of both together..."""
     least_gate: float = 0.02
-    """...or within this (m). One that doesn't takes the cell's place if it is higher, and rays that pass below do at once:
-    with a pose that drifts, what was seen last is nearest to the truth..."""
+    """...or within this (m). One that doesn't takes the cell's place if it is higher, and rays that pass below do at
+    once: with a pose that drifts, what was seen last is nearest to the truth..."""
     doubt: float = 0.018
     """...but one that is lower may be the side of a step in the same cell: it adds the square of this (m) to the cell's
     variance..."""
@@ -50,13 +51,15 @@ class ElevationConfig:
     passes: int = 14
     """Cells before a ray's end over which it is taken to pass."""
     rings: tuple[int, ...] = (1, 2, 3, 5, 8)
-    """Half widths (cells) of the squares in which a cell that isn't measured looks for cells that tell of the ground."""
+    """Half widths (cells) of the squares in which a cell that isn't measured looks for cells that tell of the
+    ground."""
     beside: int = 4
     """Half width (cells) of the square whose highest cell a hole is compared with."""
     step: float = 0.04
     """A cell is a hole if it lies at least so far below that (m)..."""
     floor: float = 1 / 3
-    """...and isn't floor: no more than this share of it and its neighbours, those that are measured, lie at its height."""
+    """...and isn't floor: no more than this share of it and its neighbours, those that are measured, lie at its
+    height."""
     hole: float = 0.3
     """Depth (m) of a hole whose floor isn't seen. Deeper than what the policy tells apart, 0.25 m."""
 
@@ -96,7 +99,7 @@ class ElevationMap:
         """Whether cells (..., 2) lie on the map: (...)."""
         half = self.config.cells // 2
         away = cells - self.centre
-        return ((away >= -half) & (away < half)).all(axis=-1)
+        return np.all((away >= -half) & (away < half), axis=-1)
 
     def index(self, cells: np.ndarray) -> np.ndarray:
         """Where cells (..., 2) are kept: (...) into `height`."""
@@ -126,7 +129,9 @@ class ElevationMap:
             self.height[where], self.variance[where] = ground, self.config.bound_deviation**2
 
     def move(self, position: np.ndarray) -> None:
-        """Rolls the map to a new position (2,) m of the robot; what comes in anew is unknown, heights lose certainty."""
+        """Rolls the map to a new position (2,) m of the robot; what comes in anew is unknown, heights lose
+        certainty.
+        """
         n, centre = self.config.cells, self.cells_of(np.asarray(position[:2], float))
         way = float(np.hypot(*(position[:2] - self.position)))
         shift = centre - self.centre
@@ -164,7 +169,8 @@ class ElevationMap:
         self._pass(passed, low[passed])
 
     def read(self, places: np.ndarray) -> np.ndarray:
-        """Heights (...) m at places (..., 2) m: of the cell and those beside it that agree, or filled in from around it.
+        """Heights (...) m at places (..., 2) m: of the cell and those beside it that agree, or filled in from around
+        it.
 
         A cell that isn't measured is taken to be as low as the lowest that is known in the smallest square round it in
         which anything is: what is hidden is hidden by something higher. A hole is taken to be deep.
@@ -185,8 +191,8 @@ class ElevationMap:
     def _seen(self, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Heights (C,) m of cells (C, 2), and the numbers of those that were not seen and are no holes.
 
-        From the side only a hole's upper part is seen: its walls, or rays that pass into it. How far down depends on where
-        the robot looks from, not on the ground.
+        From the side only a hole's upper part is seen: its walls, or rays that pass into it. How far down depends on
+        where the robot looks from, not on the ground.
         """
         c, own = self.config, self.index(cells)
         offset = np.arange(-c.beside, c.beside + 1)

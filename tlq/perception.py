@@ -76,7 +76,9 @@ class PoseEstimate:
         self._true = np.array(position)
 
     def orientation(self, true: np.ndarray) -> np.ndarray:
-        """The estimate (4,), w x y z, of an orientation (4,): gravity tells roll and pitch, nothing tells the heading."""
+        """The estimate (4,), w x y z, of an orientation (4,): gravity tells roll and pitch, nothing tells the
+        heading.
+        """
         cos, sin = np.cos(0.5 * self.turned), np.sin(0.5 * self.turned)
         w, x, y, z = true
         return np.array([cos * w - sin * z, cos * x - sin * y, cos * y + sin * x, cos * z + sin * w])
