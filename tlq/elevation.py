@@ -195,17 +195,15 @@ class ElevationMap:
         where the robot looks from, not on the ground.
         """
         c, own = self.config, self.index(cells)
-        offset = np.arange(-c.beside, c.beside + 1)
-        steps = np.stack(np.meshgrid(offset, offset), axis=-1).reshape(-1, 2)
-        around = cells[:, None] + steps
-        where = self.index(around)
+        where, inside = self._around(cells, c.beside)
         height, variance = self.height[where], self.variance[where]
-        measured = self.inside(around) & np.isfinite(variance) & ~self.bound[where]
+        measured = inside & np.isfinite(variance) & ~self.bound[where]
         error = np.sqrt(np.where(measured, variance, 0.0))
         here, known = self.height[own], self.inside(cells) & np.isfinite(self.variance[own])
         doubt = np.sqrt(np.where(known, self.variance[own], 0.0))
 
-        near = np.abs(steps).max(axis=1) <= 1
+        steps = np.arange(-c.beside, c.beside + 1)
+        near = np.flatnonzero(np.maximum(np.abs(steps)[:, None], np.abs(steps)) <= 1)
         level = np.abs(height[:, near] - here[:, None]) <= np.maximum(
             np.hypot(error[:, near], doubt[:, None]), c.least_gate
         )
@@ -222,13 +220,24 @@ class ElevationMap:
 
     def _lowest(self, cells: np.ndarray, ring: int) -> tuple[np.ndarray, np.ndarray]:
         """The lowest known cell (C, 2) within `ring` cells of cells (C, 2), and whether any is measured there (C,)."""
-        offset = np.arange(-ring, ring + 1)
-        around = cells[:, None] + np.stack(np.meshgrid(offset, offset), axis=-1).reshape(-1, 2)
-        where = self.index(around)
-        known = self.inside(around) & np.isfinite(self.variance[where])
+        where, inside = self._around(cells, ring)
+        known = inside & np.isfinite(self.variance[where])
         lowest = np.where(known, self.height[where], np.inf).argmin(axis=1)
         # Bounds alone don't tell of the ground: a ray may pass high over all of them.
-        return around[np.arange(len(cells)), lowest], (known & ~self.bound[where]).any(axis=1)
+        step = np.stack(np.divmod(lowest, 2 * ring + 1), axis=-1) - ring
+        return cells + step, (known & ~self.bound[where]).any(axis=1)
+
+    def _around(self, cells: np.ndarray, half: int) -> tuple[np.ndarray, np.ndarray]:
+        """The cells of squares round cells (C, 2): where they are kept (C, W), row by row, and whether on the map."""
+        n, steps = self.config.cells, np.arange(-half, half + 1)
+        line = cells[:, :, None] + steps
+        away = line - self.centre[:, None]
+        on = (away >= -(n // 2)) & (away < n // 2)
+        kept = line % n
+        where = kept[:, 0, :, None] * n + kept[:, 1, None, :]
+        inside = on[:, 0, :, None] & on[:, 1, None, :]
+        square = (len(cells), (2 * half + 1) ** 2)
+        return where.reshape(square), inside.reshape(square)
 
     def _tops(self, points: np.ndarray, variance: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """What a scan says of the cells it hit: their place (C,), height (C,) m and variance (C,) m².
