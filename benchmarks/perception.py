@@ -10,6 +10,7 @@ numbers of training's noise (`envs.RandomisationConfig`) are fitted to them.
 
 import dataclasses
 import sys
+import time
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -168,6 +169,22 @@ def record(options: Options, kind: str) -> Errors:
     return Errors(*(np.array(column) for column in zip(*rows, strict=True)))
 
 
+def sensing_ms(options: Options, kind: str, count: int = 100) -> float:
+    """Median time (ms of a core) of rays, fusion and reading in a control step, after half a second of walking."""
+    controller = Controller(cli.find_policy(options.policy))
+    terrain = terrains.make_terrain(options.terrain, options.difficulty, evaluate.FIRST_SEED + options.seed)
+    config = training_env(controller.metadata)
+    sim = Simulation(controller, terrain, config, perception=PerceptionConfig(kind=kind))
+    for _ in range(25):
+        sim.step(evaluate.direction(0))
+    times = []
+    for _ in range(count):
+        began = time.process_time()
+        sim.look()
+        times.append(time.process_time() - began)
+    return 1e3 * float(np.median(times))
+
+
 def compare(sim: Simulation, fit: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """One row of `Errors`; without `fit` the shift is NaN."""
     level = np.repeat(sim.controller.core.feet(sim.exact_sensors())[:, 2], sim.points.shape[1])
@@ -271,6 +288,7 @@ def main(arguments: Sequence[str]) -> None:
         errors = record(options, kind)
         result[f"{kind}_errors"] = described(errors)
         result[f"{kind}_fitted"] = fitted(errors)
+        result[f"{kind}_sensing_ms"] = sensing_ms(options, kind)
     result["distance"] = curves(options)
     if options.picture:
         draw(result["distance"], options)
