@@ -10,6 +10,7 @@ import numpy as np
 
 from envs.robot import RobotConfig, robot_spec
 from envs.robots.look import HIDDEN_GROUP, LOOK_GROUP
+from envs.robots.quadruped import LEGS
 from terrains import Terrain, add_to_spec, footprint_distance
 
 HORIZON = (0.80, 0.86, 0.92)
@@ -31,6 +32,7 @@ def build_scene(
     look: bool = False,
     path: np.ndarray | None = None,
     reach: float = 3.0,
+    limbs: bool = False,
 ) -> mujoco.MjModel:
     """The robot on a terrain (without one: on a plane); only feet and ground collide, at the feet's friction.
 
@@ -43,11 +45,14 @@ def build_scene(
         physics is the same: what collides is hidden in group 3, and a coloured copy without contact is drawn.
       path: (N, 2) horizontal positions, m; draw only ground within `reach` of one of them.
       reach: m.
+      limbs: give thighs and shanks capsules without contact, which hide the ground from range sensors.
     """
     spec = robot_spec(config, look=look)
     spec.option.timestep = timestep
     spec.option.iterations = iterations
     spec.option.ls_iterations = 50
+    if limbs:
+        _add_limbs(spec)
     group = HIDDEN_GROUP if look else 0
     if terrain is None:
         spec.worldbody.add_geom(
@@ -65,6 +70,22 @@ def build_scene(
             rows = rows[near(rows, path, reach)]
         _draw_ground(spec, rows, terrain.floor if terrain else 0.0)
     return spec.compile()
+
+
+def _add_limbs(spec: mujoco.MjSpec) -> None:
+    """Capsules along thighs and shanks, as thick as they are drawn (`envs.robots.look`)."""
+    for name in LEGS:
+        thigh, shank, foot = spec.body(f"{name}_thigh"), spec.body(f"{name}_shank"), spec.site(f"{name}_foot")
+        for body, end, radius in ((thigh, shank.pos, 0.021), (shank, foot.pos, 0.013)):
+            body.add_geom(
+                type=mujoco.mjtGeom.mjGEOM_CAPSULE,
+                size=(radius, 0, 0),
+                fromto=(0, 0, 0, *end),
+                contype=0,
+                conaffinity=0,
+                group=HIDDEN_GROUP,
+                mass=0.0,
+            )
 
 
 def near(primitives: np.ndarray, path: np.ndarray, reach: float) -> np.ndarray:

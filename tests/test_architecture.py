@@ -28,6 +28,7 @@ ON_THE_ROBOT = (
     "tlq/cli.py",
     "tlq/deploy.py",
     "tlq/judge.py",
+    "tlq/elevation.py",
 )
 """What a robot needs of `tlq`: NumPy and `tg` alone, as soon as it is imported."""
 
@@ -89,7 +90,7 @@ def test_the_runtime_can_be_imported_where_there_is_numpy_alone():
                 if name.partition(".")[0] in banned:
                     raise ImportError(f"{name} isn't on the robot")
         sys.meta_path.insert(0, Ban())
-        from tlq import deploy
+        from tlq import deploy, elevation
         from tlq.runtime import Controller
         assert not banned & set(sys.modules)
     """

@@ -25,6 +25,7 @@ from tlq import judge
 from tlq.cli import check_folders, find_policy, option, parse, run
 from tlq.config import training_env
 from tlq.files import whole
+from tlq.perception import KINDS, PerceptionConfig
 from tlq.runtime import Controller, load_policy
 
 ENGINES = ("mjx", "mujoco")
@@ -51,6 +52,17 @@ class Options:
     json: str = option("", "file to write the results to")
     noise: bool = option(False, "errors of sensors and map as in training")
     timestep: float = option(0.002, "of the physics (s); engine=mujoco only")
+    perception: str = option(
+        "map", "map: true heights; else range sensors, engine=mujoco only", choices=lambda: KINDS
+    )
+    drift: float = option(
+        PerceptionConfig.drift, "error of the pose estimate gained per metre walked (m); lidar and depth only"
+    )
+    latency: float = option(PerceptionConfig.latency, "of scans (s); lidar and depth only")
+    missing: float = option(PerceptionConfig.missing, "share of lost returns; lidar and depth only")
+    range_noise: float = option(
+        PerceptionConfig.range_noise, "multiple of the sensor's own noise; lidar and depth only"
+    )
     workers: int = option(1, "processes; engine=mujoco only")
 
 
@@ -64,6 +76,11 @@ def evaluate(options: Options, report: Callable[[str], None] = print) -> dict[st
     _check(options)
     path = find_policy(options.policy)
     policy = load_policy(path)
+    if options.perception != "map" and not policy.core.heights:
+        raise ValueError(
+            f"perception={options.perception} is of no use to policy={options.policy}, which is blind; "
+            "choose perception=map"
+        )
     walk = _walk_mujoco if options.engine == "mujoco" else _walk_mjx
     tallies = walk(options, path, policy.metadata, report)
     return summary(options, policy.metadata, tallies)
@@ -78,7 +95,33 @@ def _check(options: Options) -> None:
         raise ValueError(f"seed={options.seed} must be 0 or more")
     if not 0 < options.timestep <= 0.02:
         raise ValueError(f"timestep={options.timestep} must be in (0, 0.02]")
+    _check_perception(options)
     check_folders(options, "json")
+
+
+def perception(options: Options) -> PerceptionConfig | None:
+    """What senses the ground; None: nothing does, heights are the map's."""
+    if options.perception == "map":
+        return None
+    names = ("drift", "latency", "missing", "range_noise")
+    return PerceptionConfig(kind=options.perception, **{name: getattr(options, name) for name in names})
+
+
+def _check_perception(options: Options) -> None:
+    sensing = perception(options)
+    if sensing is None:
+        default = Options()
+        for name in ("drift", "latency", "missing", "range_noise"):
+            if getattr(options, name) != getattr(default, name):
+                raise ValueError(
+                    f"{name}={getattr(options, name)} needs perception=lidar or perception=depth"
+                )
+        return
+    if options.engine != "mujoco":
+        raise ValueError(
+            f"perception={options.perception} needs engine=mujoco; engine=mjx has no range sensors"
+        )
+    sensing.check()
 
 
 # -- engines ---------------------------------------------------------------------------------------------------------
@@ -146,7 +189,13 @@ def mujoco_episode(options: Options, path: Path, k: int) -> judge.Tally:
     terrain = terrains.make_terrain(options.terrain, options.difficulty, seed, index=k)
     noise = config.randomisation if options.noise else None
     simulation = Simulation(
-        controller, terrain, config, timestep=options.timestep, noise=noise, seed=seed + k
+        controller,
+        terrain,
+        config,
+        timestep=options.timestep,
+        noise=noise,
+        perception=perception(options),
+        seed=seed + k,
     )
     simulation.reset(start_phase(k))
     moment = simulation.moment()
@@ -179,6 +228,7 @@ def summary(options: Options, metadata: dict[str, Any], tallies: Sequence[judge.
     dt = metadata["control_dt"]
     runs = [_run(k, tally, dt) for k, tally in enumerate(tallies)]
     distance = np.array([r["distance_m"] for r in runs])
+    sensing = perception(options)
     swings, walked = sum(float(t.swings) for t in tallies), float(distance.sum())
     total = {name: sum(float(getattr(t, name)) for t in tallies) for name in ("work", "lift", "unsafe")}
     return {
@@ -189,6 +239,7 @@ def summary(options: Options, metadata: dict[str, Any], tallies: Sequence[judge.
         "episodes": len(runs),
         "seed": options.seed,
         "noise": options.noise,
+        "perception": {"kind": "map"} if sensing is None else dataclasses.asdict(sensing),
         "method": metadata["method"],
         "commit": metadata["commit"],
         "distance_m": {"mean": distance.mean(), "std": distance.std(), "min": distance.min()},

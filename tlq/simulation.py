@@ -13,6 +13,7 @@ from envs.robot import read_robot
 from envs.scene import build_scene
 from terrains import Terrain, exact_height
 from tlq.judge import Moment
+from tlq.perception import Perception, PerceptionConfig
 from tlq.runtime import Controller
 
 
@@ -27,6 +28,7 @@ class Simulation:
         *,
         timestep: float = 0.002,
         noise: RandomisationConfig | None = None,
+        perception: PerceptionConfig | None = None,
         seed: int = 0,
     ):
         """Puts the robot on the terrain's start platform.
@@ -37,7 +39,8 @@ class Simulation:
           config: the robot, and when it counts as fallen.
           timestep: of the physics (s).
           noise: errors of sensors and map; none: exact.
-          seed: of the noise.
+          perception: range sensors and elevation map that give the heights; none: the terrain itself does.
+          seed: of the noise and of the perception's errors.
         """
         ratio = controller.control_dt / timestep
         if timestep <= 0 or abs(ratio - round(ratio)) > 1e-6:
@@ -45,7 +48,7 @@ class Simulation:
                 f"timestep={timestep} doesn't divide the control period, {controller.control_dt} s"
             )
         self.controller, self.terrain, self.config, self.noise = controller, terrain, config, noise
-        self.model = build_scene(config.robot, terrain, timestep=timestep)
+        self.model = build_scene(config.robot, terrain, timestep=timestep, limbs=perception is not None)
         self.data = mujoco.MjData(self.model)
         self.robot = read_robot(self.model, config.robot)
         self.substeps = round(ratio)
@@ -56,6 +59,10 @@ class Simulation:
         self._motors = np.array([self.model.actuator(name).id for name in controller.joint_names])
         flat, robot = physics_model(config.robot, config.physics_dt, config.num_planes)
         self._standing = settle(flat, robot, controller.core.standing_target)
+        self.perception = None
+        if perception is not None:
+            core, dt = controller.core, controller.control_dt
+            self.perception = Perception(perception, self.model, core, dt, seed)
         self._thighs = controller.core.geometry._replace(shank=np.zeros(4, np.float32))
         self.reset()
 
@@ -68,6 +75,9 @@ class Simulation:
         if self.noise is not None:
             drift = np.array([self.noise.map_drift, self.noise.map_drift, self.noise.height_drift])
             self._offset = drift * self._random.uniform(-1.0, 1.0, 3)
+        if self.perception is not None:
+            feet = self.controller.core.feet(self.exact_sensors())
+            self.perception.reset(self.data, feet, self.robot.foot_radius)
         self.look()
 
     def step(self, direction: np.ndarray) -> Moment:
@@ -141,6 +151,10 @@ class Simulation:
         self.points = self.controller.sample_points(self.sensors)
         if centres is not None:
             self.points = core.around(np.where(np.isfinite(centres), centres, self._feet[:, :2]))
+        if self.perception is not None:
+            self.perception.look(data)
+            self.heights = self.perception.heights(data, self.points)
+            return
         self.heights = self._height(self.points + offset[:2]) - data.qpos[2] + offset[2] + error
 
     def _height(self, points: np.ndarray) -> np.ndarray:
