@@ -74,7 +74,7 @@ def test_readme_begins_with_two_commands_of_a_line_each():
     lines = [line.strip() for line in README.splitlines() if line.startswith("    ")]
     install = "python3 -m venv .venv && .venv/bin/pip install -e "
     assert lines[0] == f"{install}. && .venv/bin/python train.py terrain=poles"
-    assert lines[1] == f"{install}'.[dev]' && .venv/bin/python -m pytest -m 'not slow'"
+    assert lines[1] == f"{install}'.[dev]' && .venv/bin/python -m pytest -n 2 --dist loadfile -m 'not slow'"
 
 
 def test_extras_and_versions_are_those_of_the_project():

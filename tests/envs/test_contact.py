@@ -42,7 +42,7 @@ def test_everything_happens_on_every_kind(scene):
     assert chosen(names, CORNER).sum() >= 12
 
 
-@pytest.mark.parametrize("num_planes", [1, 2])
+@pytest.mark.parametrize("num_planes", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_one_surface_at_a_time_is_mujocos(scene, num_planes):
     """Blocks, poles, stones and stairs, tops, rims and sides: no difference but rounding."""
     names, compared = scene
@@ -69,6 +69,7 @@ def test_tread_and_riser_at_once(scene, num_planes, speed, position):
     assert (found["rise"] - found["rise_reference"]).max() < 0.05
 
 
+@pytest.mark.slow
 def test_the_iterations_of_training_come_near(scene):
     names, compared = scene
     found, corner = compared(TRAINING.num_planes, TRAINING.solver_iterations), chosen(names, CORNER)

@@ -618,6 +618,7 @@ def test_metrics_name_every_term(exact):
 # Another robot ------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_go1_size_stands_and_walks_with_two_planes_a_foot():
     """One compiled program for both: the second robot, and contact with tread and riser at once."""
     robot = envs.RobotConfig(name="go1_size")

@@ -92,7 +92,12 @@ def mujoco_runs(rig, qpos, qvel):
     [
         # Standing, dropped level, dropped askew, shoved: largest deviation of the trunk within 0.2 s, m and m/s.
         (EVALUATION_ITERATIONS, [1e-4, 1e-4, 2e-4, 1e-4], [1e-3, 2e-3, 5e-3, 2e-3]),
-        (EnvConfig().solver_iterations, [2e-4, 2e-3, 4e-3, 2e-3], [0.005, 0.1, 0.1, 0.05]),
+        pytest.param(
+            EnvConfig().solver_iterations,
+            [2e-4, 2e-3, 4e-3, 2e-3],
+            [0.005, 0.1, 0.1, 0.05],
+            marks=pytest.mark.slow,
+        ),
     ],
 )
 def test_the_robot_moves_as_in_mujoco(rig, iterations, position, speed):

@@ -144,6 +144,7 @@ def test_the_batch_is_permuted_by_environments_and_nothing_is_lost(learner, trai
     assert values[4] == pytest.approx(values[1], rel=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("memory", "solves"), [("mingru", True), ("none", False)])
 def test_a_task_that_needs_the_memory(memory, solves):
     """The target is shown on the first of five steps; without a memory four of five steps are a guess."""
