@@ -42,7 +42,8 @@ def test_everything_happens_on_every_kind(scene):
     assert chosen(names, CORNER).sum() >= 12
 
 
-@pytest.mark.parametrize("num_planes", [1, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("num_planes", [1, 2])
 def test_one_surface_at_a_time_is_mujocos(scene, num_planes):
     """Blocks, poles, stones and stairs, tops, rims and sides: no difference but rounding."""
     names, compared = scene

@@ -111,6 +111,7 @@ def test_the_robot_moves_as_in_mujoco(rig, iterations, position, speed):
     assert (faster < speed).all(), faster
 
 
+@pytest.mark.slow
 def test_substep_is_mjxs_step(rig):
     """On level ground the planes lie where the model has them: the same functions on the same numbers."""
     qpos, qvel = starts(rig.settled)

@@ -57,6 +57,7 @@ def test_a_range_of_no_width_switches_a_part_off(noisy):
     np.testing.assert_array_equal(found.map_offset[:, :2], 0.0)
 
 
+@pytest.mark.slow
 def test_disabled_nothing_is_random(exact):
     found = draw(exact, exact.env._randomise, 50)
     np.testing.assert_allclose(found.friction, exact.config.robot.foot_friction)
