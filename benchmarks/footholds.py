@@ -206,8 +206,6 @@ def main(arguments: Sequence[str]) -> None:
     options = cli.parse(Options, arguments, __doc__ or "")
     cli.check_folders(options, "json")
     terrains.parse_difficulty(options.difficulty)
-    if options.retraction > 1 or not 0 <= options.frequency <= 10 or not 0 <= options.step_length <= 0.5:
-        raise ValueError("retraction= must be at most 1, frequency= in [0, 10] and step_length= in [0, 0.5]")
     if options.robots < 1 or not 0 < options.seconds <= 600:
         raise ValueError("robots= must be at least 1, and seconds= in (0, 600]")
     settings.use_cache(settings.TrainConfig().cache)

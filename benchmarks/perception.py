@@ -216,6 +216,14 @@ def best_shift(seen: np.ndarray, moved: np.ndarray, moves: np.ndarray) -> np.nda
     return moves[apart <= apart.min() + 1e-9].mean(axis=0)
 
 
+def usable(errors: Errors) -> tuple[np.ndarray, np.ndarray]:
+    """(T, P) whether an error is of level ground and no outlier, and the mean (T,) of those at a step, NaN without."""
+    good = ~errors.edge & (np.abs(errors.error) < OUTLIER)
+    return good, np.array(
+        [e[g].mean() if g.any() else np.nan for e, g in zip(errors.error, good, strict=True)]
+    )
+
+
 def fitted(errors: Errors) -> dict[str, float]:
     """Training's noise with the same spread: `height_noise`, `height_drift` and `map_drift` of `RandomisationConfig`.
 
@@ -223,8 +231,7 @@ def fitted(errors: Errors) -> dict[str, float]:
     is uniform in ± `map_drift` in x and in y, and adds normal noise of deviation `height_noise` to each height of each
     step. A uniform number in ± a has the deviation a / √3.
     """
-    good = ~errors.edge & (np.abs(errors.error) < OUTLIER)
-    offset = np.array([np.mean(e[g]) if g.any() else np.nan for e, g in zip(errors.error, good, strict=True)])
+    good, offset = usable(errors)
     alone = (errors.error - offset[:, None])[good]
     shift = errors.shift[np.isfinite(errors.shift).all(axis=1)]
     return {
@@ -236,8 +243,7 @@ def fitted(errors: Errors) -> dict[str, float]:
 
 def described(errors: Errors) -> dict[str, float | None]:
     """What the errors look like: m, and shares."""
-    good = ~errors.edge & (np.abs(errors.error) < OUTLIER)
-    offset = np.array([np.mean(e[g]) if g.any() else np.nan for e, g in zip(errors.error, good, strict=True)])
+    good, offset = usable(errors)
     outlier = np.abs(errors.error) >= OUTLIER
 
     def share(where: np.ndarray, of: np.ndarray) -> float | None:

@@ -59,27 +59,31 @@ ARRIVED = 1.5
 
 
 def places() -> np.ndarray:
-    """((2 REACH + 1)^2, 2) m, where a foot may be sent from the end of its step."""
-    axis = np.arange(-REACH, REACH + 1) * CELL
-    return np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2)
+    """(SIDE^2, 2) m, where a foot may be sent from the end of its step."""
+    return _square(REACH).reshape(-1, 2)
+
+
+def _square(reach: int) -> np.ndarray:
+    """(2 reach + 1, 2 reach + 1, 2) m, cells round the end of a step."""
+    axis = np.arange(-reach, reach + 1) * CELL
+    return np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1)
 
 
 def gap_shares(env: QuadrupedEnv, episode: Episode, ends: jax.Array) -> jax.Array:
-    """How much gap (N, places) a foot meets that lands near one of `places`, from the ends (N, 2) m of the steps."""
-    axis = np.arange(-REACH - NEAR, REACH + NEAR + 1) * CELL
-    patch = jnp.asarray(np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1), jnp.float32)
+    """How much gap (N, SIDE, SIDE) a foot meets that lands near one of `places`, from the ends (N, 2) m of N steps."""
+    patch = jnp.asarray(_square(REACH + NEAR), jnp.float32)
     heights = env._heights(episode, ends[:, None, None] + patch)
     highest = jnp.max(heights, axis=(1, 2), keepdims=True)
     low = (highest - heights > env.config.rewards.gap_threshold).astype(jnp.float32)
     # A normal distribution is one along x times one along y.
     weights = np.exp(-0.5 * np.square(np.arange(-NEAR, NEAR + 1) * CELL / ERROR))
-    rows = sum(w * low[:, i : i + SIDE] for i, w in enumerate(weights / weights.sum()))
-    shares = sum(w * rows[:, :, i : i + SIDE] for i, w in enumerate(weights / weights.sum()))
-    return shares.reshape(len(ends), -1)
+    weights /= weights.sum()
+    rows = sum(w * low[:, i : i + SIDE] for i, w in enumerate(weights))
+    return sum(w * rows[:, :, i : i + SIDE] for i, w in enumerate(weights))
 
 
 class Steps(NamedTuple):
-    """The two feet farthest into their swing, and the ground where they may land. Heading frame, N places each."""
+    """The two feet farthest into their swing, and the ground where they may land. Heading frame."""
 
     legs: jax.Array
     """(2,) int32."""
@@ -90,7 +94,7 @@ class Steps(NamedTuple):
     now: jax.Array
     """(2, 2) m, where they are led already, from `ends`, made up for what `share` holds back."""
     gaps: jax.Array
-    """(2, N) share of gap that a foot meets there."""
+    """(2, SIDE, SIDE) share of gap that a foot meets that lands near one of `places`."""
     ahead: jax.Array
     """(2,) m, the displacement that balance asks for."""
     asked: jax.Array
@@ -110,15 +114,16 @@ def steps(env: QuadrupedEnv, episode: Episode) -> Steps:
     # The mean speed of feet in stance.
     speed = 2.0 * controller.frequency * env.core.config.step_length
     ahead = jnp.clip(BALANCE * (env.velocity(episode) - speed * controller.stride), -AWAY, AWAY)
-    here = between(gaps.reshape(2, SIDE, SIDE), now)
-    danger = jnp.maximum(here, gaps[:, SIDE * SIDE // 2]) > SAFE
+    danger = jnp.maximum(between(gaps, now), gaps[:, REACH, REACH]) > SAFE
     walking = jnp.sum(jnp.square(episode.command)) > 0.5
     return Steps(legs, ends, share, now, gaps, ahead, danger & (phases[legs] > LIFTING) & walking)
 
 
 def between(gaps: jax.Array, displacement: jax.Array) -> jax.Array:
     """Bilinear share (...) of gap at displacements (..., 2) m, of a map (..., SIDE, SIDE); at its rim beyond it."""
-    at = jnp.clip(displacement / CELL + REACH, 0.0, SIDE - 1.001)
+    at = jnp.clip(
+        displacement / CELL + REACH, 0.0, SIDE - 1.001
+    )  # short of the last cell, which has no next one
     low = jnp.floor(at).astype(jnp.int32)
     x, y = jnp.moveaxis(at - low, -1, 0)
     flat = gaps.reshape(*gaps.shape[:-2], SIDE * SIDE)
@@ -140,7 +145,8 @@ def displacements(env: QuadrupedEnv, episode: Episode) -> tuple[jax.Array, jax.A
     s = steps(env, episode)
     away = jnp.linalg.norm(s.now[:, None] - places(), axis=-1)
     far = jnp.linalg.norm(s.ahead - places(), axis=-1)
-    best = _best_pair(s.gaps + FARTHER * far + ANOTHER * away, s.ahead, s.ends[0] - s.ends[1])
+    cost = s.gaps.reshape(2, -1) + FARTHER * far + ANOTHER * away
+    best = _best_pair(cost, s.ahead, s.ends[0] - s.ends[1])
     led = jnp.zeros((4, 2)).at[s.legs].set(s.share[:, None] * best)
     return led, jnp.zeros(4, bool).at[s.legs].set(s.asked)
 
@@ -215,44 +221,52 @@ def guide(env: QuadrupedEnv, episode: Episode, held: jax.Array) -> Guidance:
 
     held: (4, 2) m, of `Guided`.
     """
-    s, core = steps(env, episode), env.core
-    target, level = _target(env, episode)
-    last = episode.controller.actions[0][2:].reshape(4, 3)
+    s, controller = steps(env, episode), episode.controller
+    walking = jnp.sum(jnp.square(episode.command)) > 0.5
+    stance = (tg.path.leg_phases(controller.phase) <= 0) & walking
+    own = Guidance(
+        lead=_lead(env, episode),
+        legs=s.legs.astype(jnp.int32),
+        gaps=s.gaps.astype(jnp.float16),
+        ahead=s.ahead,
+        across=_across(s.ends[0] - s.ends[1]),
+        weight=jnp.where(s.asked, s.share, 0.0),
+        held=held,
+        hold=jnp.where(stance, jnp.clip(jnp.linalg.norm(held, axis=-1) / LED, 0.0, 1.0), 0.0),
+    )
+    mirror = env.core.update_mirror(controller.mirror, env.heading_command(episode))
+    return jax.tree.map(lambda mine, other: jnp.where(mirror > 0, mine, other), own, _mirrored(own))
+
+
+def _lead(env: QuadrupedEnv, episode: Episode) -> jax.Array:
+    """`Guidance.lead` (4, 2, 4) of the robot's own sides, round the last action: the next doesn't differ by much."""
+    core, (target, level) = env.core, _target(env, episode)
     standing = tg.leg.inverse(core.geometry, target)
 
     def feet(action: jax.Array) -> jax.Array:
         reached = tg.leg.forward(core.geometry, standing + core.config.residual_range * action)
         return ((reached - target) @ level.T)[:, :2]
 
-    def turned(joint: int) -> tuple[jax.Array, jax.Array]:
-        return jax.jvp(feet, (last,), (jnp.zeros_like(last).at[:, joint].set(1.0),))
-
-    # Round the last action, from which the next doesn't differ by much.
-    moved, *slopes = turned(0)[0], *(turned(joint)[1] for joint in range(3))
-    slope = jnp.stack(slopes, axis=-1)
+    last = episode.controller.actions[0][2:].reshape(4, 3)
+    moved, change = jax.linearize(feet, last)
+    slope = jnp.stack([change(jnp.zeros((4, 3)).at[:, joint].set(1.0)) for joint in range(3)], axis=-1)
     rest = moved - jnp.einsum("lij,lj->li", slope, last)
-    lead = jnp.concatenate([slope, rest[..., None]], axis=-1)
-    gaps = s.gaps.reshape(2, SIDE, SIDE).astype(jnp.float16)
-    across, weight = _across(s.ends[0] - s.ends[1]), jnp.where(s.asked, s.share, 0.0)
-    stance = (tg.path.leg_phases(episode.controller.phase) <= 0) & (
-        jnp.sum(jnp.square(episode.command)) > 0.5
-    )
-    hold = jnp.where(stance, jnp.clip(jnp.linalg.norm(held, axis=-1) / LED, 0.0, 1.0), 0.0)
-    own = Guidance(lead, s.legs.astype(jnp.int32), gaps, s.ahead, across, weight, held, hold)
-    # In the mirror left is right, and the abduction joints turn the other way.
+    return jnp.concatenate([slope, rest[..., None]], axis=-1)
+
+
+def _mirrored(guidance: Guidance) -> Guidance:
+    """In the mirror left is right, and the abduction joints turn the other way."""
     side, swapped = jnp.array([1.0, -1.0]), jnp.array([1, 0, 3, 2], jnp.int32)
-    other = Guidance(
-        lead[swapped] * jnp.asarray([[-1.0, 1.0, 1.0, 1.0], [1.0, -1.0, -1.0, -1.0]]),
-        swapped[s.legs],
-        gaps[:, :, ::-1],
-        s.ahead * side,
-        across * side,
-        weight,
-        held[swapped] * side,
-        hold[swapped],
+    return Guidance(
+        lead=guidance.lead[swapped] * jnp.array([[-1.0, 1.0, 1.0, 1.0], [1.0, -1.0, -1.0, -1.0]]),
+        legs=swapped[guidance.legs],
+        gaps=guidance.gaps[:, :, ::-1],
+        ahead=guidance.ahead * side,
+        across=guidance.across * side,
+        weight=guidance.weight,
+        held=guidance.held[swapped] * side,
+        hold=guidance.hold[swapped],
     )
-    mirror = core.update_mirror(episode.controller.mirror, env.heading_command(episode))
-    return jax.tree.map(lambda mine, mirrored: jnp.where(mirror > 0, mine, mirrored), own, other)
 
 
 def cost(guidance: Guidance, action: jax.Array) -> jax.Array:

@@ -13,6 +13,8 @@ from envs.robots.look import HIDDEN_GROUP, LOOK_GROUP
 from envs.robots.quadruped import LEGS
 from terrains import Terrain, add_to_spec, footprint_distance
 
+LIMBS = (0.021, 0.013)
+"""Radii of thighs and shanks (m): about what is drawn (`envs.robots.look`)."""
 HORIZON = (0.80, 0.86, 0.92)
 """Colour in which sky and ground meet."""
 ZENITH = (0.42, 0.60, 0.82)
@@ -73,10 +75,10 @@ def build_scene(
 
 
 def _add_limbs(spec: mujoco.MjSpec) -> None:
-    """Capsules along thighs and shanks, as thick as they are drawn (`envs.robots.look`)."""
+    """Capsules along thighs and shanks."""
     for name in LEGS:
         thigh, shank, foot = spec.body(f"{name}_thigh"), spec.body(f"{name}_shank"), spec.site(f"{name}_foot")
-        for body, end, radius in ((thigh, shank.pos, 0.021), (shank, foot.pos, 0.013)):
+        for body, end, radius in zip((thigh, shank), (shank.pos, foot.pos), LIMBS, strict=True):
             body.add_geom(
                 type=mujoco.mjtGeom.mjGEOM_CAPSULE,
                 size=(radius, 0, 0),

@@ -40,3 +40,22 @@ def test_footholds(tmp_path):
     assert 0.5 < found["distance_m"] <= 5 and 0 <= found["stance_over_gap"] <= 1
     assert 0 < found["moved_on_m"] < 0.1 and 0 < found["led_moves_m"] < 0.1
     assert 0 < found["landing_error_1_m"] < found["landing_error_8_m"] < 0.2
+
+
+@pytest.mark.slow
+def test_perception(tmp_path):
+    picture = tmp_path / "curves.png"
+    arguments = [
+        "policy=flat",
+        "terrain=flat",
+        "sweep=missing",
+        "episodes=1",
+        "walks=1",
+        f"picture={picture}",
+    ]
+    found = result("perception", arguments, tmp_path)
+    for kind in ("lidar", "depth"):
+        assert [point["value"] for point in found["distance"]["missing"][kind]] == [0.05, 0.4, 0.8]
+        assert 0 < found["distance"][kind]["mean_m"] <= 5
+        assert abs(found[f"{kind}_errors"]["bias_m"]) < 0.02 and found[f"{kind}_sensing_ms"] > 0
+    assert picture.stat().st_size > 5000

@@ -29,6 +29,8 @@ from tlq.perception import KINDS, PerceptionConfig
 from tlq.runtime import Controller, load_policy
 
 ENGINES = ("mjx", "mujoco")
+SENSING = ("drift", "latency", "missing", "range_noise")
+"""Options that range sensors alone have."""
 DIRECTIONS = (0.0, math.pi / 4, -math.pi / 4, -math.pi, -5 * math.pi / 4, -3 * math.pi / 4)
 """The paper's, rad; episode k takes number k % 6."""
 FIRST_SEED = 10_000
@@ -103,15 +105,14 @@ def perception(options: Options) -> PerceptionConfig | None:
     """What senses the ground; None: nothing does, heights are the map's."""
     if options.perception == "map":
         return None
-    names = ("drift", "latency", "missing", "range_noise")
-    return PerceptionConfig(kind=options.perception, **{name: getattr(options, name) for name in names})
+    return PerceptionConfig(kind=options.perception, **{name: getattr(options, name) for name in SENSING})
 
 
 def _check_perception(options: Options) -> None:
     sensing = perception(options)
     if sensing is None:
         default = Options()
-        for name in ("drift", "latency", "missing", "range_noise"):
+        for name in SENSING:
             if getattr(options, name) != getattr(default, name):
                 raise ValueError(
                     f"{name}={getattr(options, name)} needs perception=lidar or perception=depth"

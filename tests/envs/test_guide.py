@@ -149,8 +149,7 @@ def test_guidance_is_about_the_policys_own_actions(exact, command, mirror):
         np.testing.assert_allclose(guidance.across @ (side * (steps.ends[0] - steps.ends[1])), 0, atol=1e-6)
         np.testing.assert_allclose(np.linalg.norm(guidance.across), 1, rtol=1e-5)
         np.testing.assert_allclose(guidance.weight, np.where(steps.asked, steps.share, 0))
-        gaps = guidance.gaps.reshape(2, guide.SIDE, guide.SIDE)[:, :, :: round(float(mirrored))]
-        np.testing.assert_allclose(gaps.reshape(2, -1), steps.gaps, atol=1e-3)
+        np.testing.assert_allclose(guidance.gaps[:, :, :: round(float(mirrored))], steps.gaps, atol=1e-3)
         still = feet_by_mujoco(exact, episode, np.zeros(14))
         for action, off in ((last, 1e-4), (last + random.uniform(-0.1, 0.1, 14), 2e-3)):
             moved = (feet_by_mujoco(exact, episode, action) - still)[order] * side

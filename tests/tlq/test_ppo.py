@@ -1,6 +1,11 @@
 """PPO: replayed probabilities are the stored ones, one compilation, and a task that needs the memory is learned."""
 
 import dataclasses
+import functools
+import os
+import socket
+import subprocess
+import sys
 
 import jax
 import jax.numpy as jnp
@@ -8,13 +13,16 @@ import numpy as np
 import pytest
 from brax.envs.base import Wrapper
 from brax.envs.wrappers.training import VmapWrapper
+from brax.training.agents.ppo.losses import compute_ppo_loss
+from brax.training.types import Transition
 from jax.sharding import PartitionSpec as P
 
 from envs import guide
 from tests.tlq.toy import ACTIONS, ToyEnv
+from tlq.loss import ppo_loss
 from tlq.memory import RecurrentWrapper, carry_size
 from tlq.networks import NetworkConfig, make_networks
-from tlq.ppo import AXIS, Learner, PPOConfig, make_mesh
+from tlq.ppo import AXIS, Learner, PPOConfig, adapt_learning_rate, hoist, make_mesh, summarise
 
 NETWORKS = NetworkConfig(
     memory_width=16, memory_layers=1, encoder=32, foot_encoder=(8, 4), head=16, critic=(32,)
@@ -198,3 +206,211 @@ def test_a_policy_learns_where_its_guide_sees_ground():
     assert residual[2, 1] > 0.5
     np.testing.assert_allclose(residual[0, :2], [0.5, 0.0], atol=0.1)
     assert losses[-1] < 0.6 * losses[0]
+    # What a failed update would leave.
+    batch = learner.batch(state)
+    assert batch["guide_lead"].shape == (12, B, 4, 2, 4) and batch["guide_hold"].shape == (12, B, 4)
+
+
+def test_constants_become_arguments():
+    table = jnp.arange(1000.0)
+    constants, pure = hoist(lambda x: {"y": table[x["i"]] + 1}, {"i": jax.ShapeDtypeStruct((), jnp.int32)})
+    assert any(x is table for x in constants)
+    assert float(pure(constants, {"i": jnp.int32(3)})["y"]) == 4.0
+    assert float(pure([x + 10 if x is table else x for x in constants], {"i": jnp.int32(3)})["y"]) == 14.0
+
+
+def test_the_learning_rate_follows_the_kl():
+    config = PPOConfig(kl_target=0.01, learning_rate_min=1e-5, learning_rate_max=1e-3)
+    rate = functools.partial(adapt_learning_rate, config=config)
+    assert float(rate(jnp.float32(4e-4), 0.021)) == pytest.approx(2e-4)  # above twice the target: half
+    assert float(rate(jnp.float32(4e-4), 0.0049)) == pytest.approx(6e-4)  # below half of it: 1.5 times
+    assert float(rate(jnp.float32(4e-4), 0.01)) == pytest.approx(4e-4)
+    assert float(rate(jnp.float32(9e-4), 0.001)) == pytest.approx(1e-3)
+    assert float(rate(jnp.float32(1e-5), 1.0)) == pytest.approx(1e-5)
+    assert adapt_learning_rate(3e-4, 1.0, dataclasses.replace(config, kl_target=0)) == 3e-4
+
+
+def test_figures_of_episodes_are_means_over_episodes():
+    # 2 of 8 steps end an episode, at 3 m and 5 m, one of them by a fall.
+    means = {"episode/ended": 2 / 8, "episode/distance": 8 / 8, "episode/fell": 1 / 8, "reward": 0.5}
+    figures = summarise(jax.tree.map(jnp.float32, means), 8)
+    assert {k: float(v) for k, v in figures.items()} == {
+        "episode/distance": 4.0, "episode/fell": 0.5, "reward": 0.5, "episodes": 2.0,
+    }  # fmt: skip
+
+
+def test_environments_that_cannot_be_split_evenly_are_refused():
+    with pytest.raises(ValueError, match="num_envs=32 must be a multiple of devices x minibatches = 1 x 5"):
+        make_learner(config=dataclasses.replace(CONFIG, minibatches=5))
+
+
+COMPARED = """
+import sys, numpy as np, jax
+from tests.tlq.test_ppo import SHARED, make_learner
+learner = make_learner(config=SHARED, devices=0)
+state = learner.init(0)
+for _ in range(3):
+    state, metrics = learner.step(state)
+    metrics = jax.device_get(metrics)
+parts = jax.tree.leaves((state.params, state.opt_state, state.normaliser, state.learning_rate))
+if jax.process_index() == 0:
+    np.savez(sys.argv[1], *map(np.asarray, parts), reward=metrics["reward"], kl=metrics["kl"])
+assert state.env_state.reward.addressable_shards[0].data.shape == (32 // jax.device_count(),)
+"""
+SHARED = dataclasses.replace(CONFIG, epochs=2, minibatches=2, entropy=1e-2, kl_target=0.02)
+JOIN = """
+from tlq.cores import join
+join(sys.argv[2], 2, int(sys.argv[3]))
+"""
+
+
+def run_python(code, *arguments):
+    return subprocess.Popen(
+        [sys.executable, "-c", code, *map(str, arguments)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        env=os.environ | {"XLA_FLAGS": "", "PJRT_NPROC": "8"},
+    )
+
+
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory):
+    """Parameters, optimiser, normaliser and figures after three iterations on one device."""
+    path = tmp_path_factory.mktemp("alone") / "one.npz"
+    process = run_python(COMPARED, path)
+    out, _ = process.communicate(timeout=600)
+    assert process.returncode == 0, out
+    return dict(np.load(path))
+
+
+def assert_the_same_update(path, alone):
+    with np.load(path) as found:
+        assert set(found.files) == set(alone)
+        for name, x in alone.items():
+            np.testing.assert_allclose(found[name], x, rtol=2e-3, atol=2e-5, err_msg=name)
+
+
+def test_two_devices_make_the_update_of_one(alone, tmp_path):
+    two = 'import jax; jax.config.update("jax_num_cpu_devices", 2)\n'
+    process = run_python(two + COMPARED, tmp_path / "two.npz")
+    out, _ = process.communicate(timeout=600)
+    assert process.returncode == 0, out
+    assert_the_same_update(tmp_path / "two.npz", alone)
+
+
+def test_two_processes_make_the_update_of_one(alone, tmp_path):
+    """Over loopback, as on two hosts."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{probe.getsockname()[1]}"
+    code = COMPARED.replace("from tests", JOIN + "from tests", 1)
+    processes = [run_python(code, tmp_path / "two.npz", address, i) for i in (0, 1)]
+    outputs = [process.communicate(timeout=600)[0] for process in processes]
+    for process, out in zip(processes, outputs, strict=True):
+        assert process.returncode == 0, out
+    assert_the_same_update(tmp_path / "two.npz", alone)
+
+
+def test_the_loss_is_braxs(learner, trained):
+    """Value and gradient, without the entropy, whose noise is drawn in another way."""
+    state, _ = trained
+    env_state, rollout, _ = rollout_of(learner, state)
+    carry, last = state.env_state.obs["carry"], env_state.obs["privileged_state"]
+    params = jax.tree.map(lambda x: x + 0.01 * jax.random.normal(KEY, x.shape), state.params)
+    settings = PPOConfig(
+        entropy=0.0, discount=0.97, gae_lambda=0.9, clip=0.1, value_loss=0.7, reward_scaling=0.3
+    )
+
+    def mine(params):
+        keys = jnp.zeros((B, 2), jnp.uint32)
+        return ppo_loss(
+            params, state.normaliser, rollout, carry, last, keys,
+            networks=learner.networks, config=settings, axis=AXIS,
+        )  # fmt: skip
+
+    def braxs(params):
+        swapped = lambda x: jnp.swapaxes(x, 0, 1)  # noqa: E731
+        data = Transition(
+            observation=jax.tree.map(swapped, dict(rollout.observation, carry=carry[None])),
+            action=(),
+            reward=swapped(rollout.reward),
+            discount=swapped(1 - rollout.done),
+            next_observation={"privileged_state": last[:, None]},
+            extras={
+                "state_extras": {"truncation": swapped(rollout.truncation)},
+                "policy_extras": {
+                    "raw_action": {"action": swapped(rollout.action)},
+                    "log_prob": swapped(rollout.log_prob),
+                    "distribution_params": {"action": swapped(rollout.parameters)},
+                },
+            },
+        )
+        return compute_ppo_loss(
+            params, state.normaliser, data, KEY, learner.networks, entropy_cost=0.0, discounting=0.97,
+            reward_scaling=0.3, gae_lambda=0.9, clipping_epsilon=0.1, vf_coefficient=0.7,
+        )  # fmt: skip
+
+    shard = jax.shard_map(
+        jax.value_and_grad(mine, has_aux=True),
+        mesh=learner.mesh,
+        in_specs=P(),
+        out_specs=P(),
+        check_vma=False,
+    )
+    (loss, parts), grads = jax.jit(shard)(params)
+    (expected, other), expected_grads = jax.jit(jax.value_and_grad(braxs, has_aux=True))(params)
+    assert np.asarray(rollout.truncation).any() and np.asarray(rollout.done - rollout.truncation).any()
+    assert float(loss) == pytest.approx(float(expected), rel=1e-5)
+    for name, brax_name in [("policy", "policy_loss"), ("value", "v_loss"), ("kl", "kl_mean")]:
+        assert float(parts[name]) == pytest.approx(float(other[brax_name]), rel=1e-4, abs=1e-6)
+    for x, y in zip(jax.tree.leaves(grads), jax.tree.leaves(expected_grads), strict=True):
+        np.testing.assert_allclose(x, y, rtol=1e-3, atol=1e-5)
+
+
+class ForBrax(Wrapper):
+    """What Brax's own loop expects beside: metrics of the episode in `info`."""
+
+    def reset(self, rng):
+        state = self.env.reset(rng)
+        return self._with_metrics(state)
+
+    def step(self, state, action):
+        return self._with_metrics(self.env.step(state, action))
+
+    def _with_metrics(self, state):
+        metrics = {"sum_reward": state.reward, "length": state.reward}
+        extra = {"episode_metrics": metrics, "episode_done": state.done, "steps": state.reward}
+        return state.replace(info=state.info | extra)
+
+
+@pytest.mark.slow
+def test_brax_trains_the_same_environment_and_networks(monkeypatch):
+    from brax.training.agents.ppo import train as brax_ppo
+
+    # Gone from newer JAX; Brax 0.14.2 still calls it.
+    replicate = lambda x, devices: jax.tree.map(lambda y: jnp.stack([y] * len(devices)), x)  # noqa: E731
+    monkeypatch.setattr(jax, "device_put_replicated", replicate, raising=False)
+    env = ForBrax(RecurrentWrapper(VmapWrapper(ToyEnv(length=5)), NETWORKS.memory_width))
+    seen = []
+    make_policy, params, _ = brax_ppo.train(
+        environment=env,
+        wrap_env=False,
+        num_timesteps=B * 12 * 4,
+        num_envs=B,
+        unroll_length=12,
+        batch_size=B // 2,
+        num_minibatches=2,
+        normalize_observations=True,
+        network_factory=functools.partial(make_networks, config=NETWORKS),
+        episode_length=5,
+        num_eval_envs=4,
+        log_training_metrics=True,
+        training_metrics_steps=1,
+        progress_fn=lambda step, metrics: seen.append(metrics),
+        use_pmap_on_reset=True,
+    )
+    assert all(np.isfinite(x).all() for x in jax.tree.leaves(params))
+    obs = jax.jit(env.reset)(jax.random.split(jax.random.PRNGKey(0), B)).obs
+    action, _ = make_policy(params, deterministic=True)(obs, jax.random.PRNGKey(0))
+    assert action["action"].shape == (B, ACTIONS) and action["carry"].shape == (B, 16)
