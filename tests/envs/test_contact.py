@@ -57,6 +57,7 @@ def test_one_surface_at_a_time_is_mujocos(scene, num_planes):
     assert (found["rise"] - found["rise_reference"]).max() < 0.01
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("num_planes, speed, position", [(1, 0.08, 0.005), (2, 0.03, 0.001)])
 def test_tread_and_riser_at_once(scene, num_planes, speed, position):
     """In a concave corner one plane takes turns between tread and riser; two hold both."""

@@ -70,6 +70,7 @@ def test_a_long_run_is_finite_and_compiled_once(noisy):
     assert noisy.step._cache_size() == noisy.reset._cache_size() == 1
 
 
+@pytest.mark.slow
 def test_step_is_a_function(noisy):
     state, action = noisy.rollout(noisy.state, 3)[-1], jnp.full(14, 0.2)
     copy = jax.tree.map(np.copy, without_keys(state))
@@ -164,6 +165,7 @@ def test_episodes_begin_on_the_platform_at_rest(exact):
         assert lowest == pytest.approx(exact.env.robot.foot_radius, abs=0.002)
 
 
+@pytest.mark.slow
 def test_it_stands_as_high_as_it_should(exact):
     """A command to stand: a second later the weight's compensation holds the trunk where it was meant to be."""
     state = change(exact.state, command=np.zeros(2), qpos=standing(exact.env))

@@ -245,6 +245,7 @@ def test_only_terrain_with_gaps_has_pits(exact):
     assert not envs.make(envs.EnvConfig(terrain=flat)).has_pits
 
 
+@pytest.mark.slow
 def test_a_guided_environment_adds_what_the_guide_says(exact):
     env = envs.Guided(exact.auto)
     state = jax.jit(env.reset)(jax.random.key(0))

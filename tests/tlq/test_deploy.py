@@ -42,6 +42,8 @@ def file(tmp_path_factory):
 def start(*arguments, **how):
     return subprocess.Popen(
         [sys.executable, "-m", "tlq.deploy", *arguments],
+        # A shell starts what runs in the background with Ctrl-C switched off, and children inherit that.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,

@@ -129,6 +129,7 @@ def test_the_same_seed_gives_the_same_run_and_another_one_another(learner, train
     ).any()
 
 
+@pytest.mark.slow
 def test_the_batch_is_permuted_by_environments_and_nothing_is_lost(learner, trained):
     """Two passes with a learning rate of zero: every minibatch's loss averages to the loss of the whole."""
     state, _ = trained
@@ -189,6 +190,7 @@ class Asking(Wrapper):
         return self._ask(self.env.step(state, action))
 
 
+@pytest.mark.slow
 def test_a_policy_learns_where_its_guide_sees_ground():
     config = dataclasses.replace(CONFIG, guide=30.0, learning_rate=3e-3, epochs=4)
     learner = make_learner(config=config, env=Asking(ToyEnv(length=5)))
@@ -291,6 +293,7 @@ def assert_the_same_update(path, alone):
             np.testing.assert_allclose(found[name], x, rtol=2e-3, atol=2e-5, err_msg=name)
 
 
+@pytest.mark.slow
 def test_two_devices_make_the_update_of_one(alone, tmp_path):
     two = 'import jax; jax.config.update("jax_num_cpu_devices", 2)\n'
     process = run_python(two + COMPARED, tmp_path / "two.npz")
@@ -299,6 +302,7 @@ def test_two_devices_make_the_update_of_one(alone, tmp_path):
     assert_the_same_update(tmp_path / "two.npz", alone)
 
 
+@pytest.mark.slow
 def test_two_processes_make_the_update_of_one(alone, tmp_path):
     """Over loopback, as on two hosts."""
     with socket.socket() as probe:
@@ -312,6 +316,7 @@ def test_two_processes_make_the_update_of_one(alone, tmp_path):
     assert_the_same_update(tmp_path / "two.npz", alone)
 
 
+@pytest.mark.slow
 def test_the_loss_is_braxs(learner, trained):
     """Value and gradient, without the entropy, whose noise is drawn in another way."""
     state, _ = trained
