@@ -187,6 +187,7 @@ def main(arguments: Sequence[str]) -> None:
     """Prints the shares, and writes the JSON."""
     options = cli.parse(Options, arguments, __doc__ or "")
     cli.check_folders(options, "json")
+    timing.check(options)
     settings.use_cache(settings.TrainConfig().cache)
     timing.put_out(measure(options), dataclasses.asdict(options), options.json)
 

@@ -62,13 +62,16 @@ class Options:
 
 
 class Environments:
-    """Environments in training, without the policy: a function that makes some steps."""
+    """Environments without the policy: a function that makes some steps.
 
-    def __init__(self, kind: str, num_envs: int, num_terrains: int):
-        self.config = settings.changed(
-            settings.default_config(),
-            {"env.terrain.kind": kind, "env.terrain.num_terrains": num_terrains, "num_envs": num_envs},
-        )
+    guided: as in training, where they also compute what the scripted guide to footholds says.
+    """
+
+    def __init__(self, kind: str, num_envs: int, num_terrains: int, guided: bool = False):
+        changes = {"env.terrain.kind": kind, "env.terrain.num_terrains": num_terrains, "num_envs": num_envs}
+        if not guided:
+            changes["ppo.guide"] = 0.0
+        self.config = settings.changed(settings.default_config(), changes)
         settings.validate(self.config)
         self.learner = make_learner(self.config)
         self.state = self.learner.init(0)
@@ -177,7 +180,8 @@ def recorded(config: envs.EnvConfig, robots: int = 64) -> tuple[np.ndarray, np.n
 
 def compare(options: Options) -> dict[str, Any]:
     """The ratios, and the rates behind them."""
-    stones = Environments("stepping_stones", options.num_envs, options.num_terrains)
+    plain = Environments("stepping_stones", options.num_envs, options.num_terrains)
+    stones = Environments("stepping_stones", options.num_envs, options.num_terrains, guided=True)
     c = MujocoC(stones.config.env, options.num_envs)
 
     def training() -> None:
@@ -185,7 +189,8 @@ def compare(options: Options) -> dict[str, Any]:
 
     found = rates(
         {
-            "env": (stones.run, stones.steps),
+            "env": (plain.run, plain.steps),
+            "guided_env": (stones.run, stones.steps),
             "mujoco_c": (c.run, stones.steps),
             "training": (training, stones.learner.steps_per_iteration),
         },
@@ -194,6 +199,7 @@ def compare(options: Options) -> dict[str, Any]:
     return {
         "env_vs_mujoco_c": found["env"] / found["mujoco_c"],
         "training_vs_env": found["training"] / found["env"],
+        "training_vs_guided_env": found["training"] / found["guided_env"],
         "env_vs_playground": playground(options, found["env"]),
         "steps_per_second": found,
         **stones.sizes(),
@@ -259,6 +265,7 @@ def main(arguments: Sequence[str]) -> None:
     """Prints the JSON."""
     options = cli.parse(Options, arguments, __doc__ or "")
     cli.check_folders(options, "json")
+    timing.check(options)
     settings.use_cache(settings.TrainConfig().cache)
     result = compare(options)
     if options.scaling:

@@ -16,6 +16,15 @@ from jax.sharding import PartitionSpec as P
 from tlq.files import whole
 from tlq.ppo import AXIS, Learner
 
+COUNTS = ("rounds", "num_envs", "num_terrains", "unroll", "most_envs")
+
+
+def check(options: Any) -> None:
+    """Raises ValueError where a number of the command line that counts something is less than 1."""
+    for name in COUNTS:
+        if getattr(options, name, 1) < 1:
+            raise ValueError(f"{name}={getattr(options, name)} must be 1 or more")
+
 
 def medians(functions: Mapping[str, Callable[[], Any]], rounds: int) -> dict[str, float]:
     """Median seconds of functions, called once to compile and then in turn, so that other load hits all of them."""

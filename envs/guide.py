@@ -29,8 +29,10 @@ SIDE = 2 * REACH + 1
 NEAR = 2
 """Cells to each side of a place that count."""
 FARTHER, ANOTHER = 1.0, 2.0
-"""What a metre costs from where balance wants the foot, and one from where it is led already; a place that is nothing
-but gap costs 1."""
+"""What a metre costs from where balance wants the foot, and one from where it is led already; to the reflex a place
+that is nothing but gap costs 1."""
+GAP = 3.0
+"""What it costs to lead a foot to nothing but gap. Robots have balance to spare, but not one footstep."""
 BALANCE = 0.15
 """Seconds of the trunk's excess speed that a foot is placed farther along, as a walking inverted pendulum asks for."""
 ACROSS = 6.0
@@ -40,6 +42,9 @@ BEYOND = 10.0
 HOLD, HELD = 0.5, 0.05
 """What it costs to lead a foot in stance by HELD (m) from where it was led when it came down; with the distance
 squared. A foot that is let go pushes the trunk by as much as it was led aside."""
+ALWAYS, IDLE = 0.05, 1.0
+"""What it costs to move a leg's joints by the whole range of residual angles, with the square; and beyond, where the
+guide asks for nothing."""
 LED = 0.02
 """Displacement (m) from which on a foot is held altogether."""
 SMOOTHING = 0.3
@@ -282,10 +287,20 @@ def cost(guidance: Guidance, action: jax.Array) -> jax.Array:
     beyond = jnp.sum(jnp.maximum(jnp.abs(led) - REACH * CELL, 0.0), axis=-1)
     off = led - guidance.ahead[..., None, :]
     far = jnp.sqrt(jnp.sum(jnp.square(off), axis=-1) + 1e-6)  # a slope at 0, too
-    each = between(guidance.gaps.astype(jnp.float32), led) + FARTHER * far + BEYOND * beyond
+    each = GAP * between(guidance.gaps.astype(jnp.float32), led) + FARTHER * far + BEYOND * beyond
     middle = jnp.abs(jnp.sum(jnp.mean(off, axis=-2) * guidance.across, axis=-1))
     both = jnp.min(guidance.weight, axis=-1)
     return jnp.sum(guidance.weight * each, axis=-1) + both * ACROSS * middle + HOLD * let_go
+
+
+def idle(guidance: Guidance, residual: jax.Array) -> jax.Array:
+    """What it costs (...) that residual actions (..., 12) before tanh move legs which had better be left alone, and to
+    move any more than it takes: lifting a foot leads it nowhere.
+    """
+    squares = jnp.sum(jnp.square(residual.reshape(*residual.shape[:-1], 4, 3)), axis=-1)
+    swing = jnp.sum(guidance.weight[..., None] * (guidance.legs[..., None] == jnp.arange(4)), axis=-2)
+    asked = jnp.maximum(guidance.hold, swing)
+    return jnp.sum((ALWAYS + IDLE * (1.0 - asked)) * squares, axis=-1)
 
 
 class Guided(Wrapper):

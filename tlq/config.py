@@ -16,6 +16,7 @@ import tg
 from envs.config import METHODS, EnvConfig
 from tlq.cli import UsageError, unknown
 from tlq.files import whole
+from tlq.networks import BEFORE as BEFORE_NETWORKS
 from tlq.networks import NetworkConfig
 from tlq.ppo import PPOConfig
 
@@ -36,6 +37,7 @@ LIMITS: dict[str, tuple[float, float]] = {
     "policy.foot_encoder": _WIDTH,
     "policy.head": _WIDTH,
     "policy.leg_head": (0, 4096),
+    "policy.foothold_head": (0, 4096),
     "policy.leg_context": _WIDTH,
     "policy.critic": _WIDTH,
     "policy.initial_std": (0.01, 10.0),
@@ -55,6 +57,9 @@ LIMITS: dict[str, tuple[float, float]] = {
     "ppo.max_grad_norm": (1e-6, 1e6),
     "ppo.reward_scaling": (1e-6, 1e6),
     "ppo.guide": (0.0, 1e3),
+    "init_spread": (0.01, 100.0),
+    "ppo.guide_rate": (0.0, 1.0),
+    "ppo.guide_epochs": (1, 1000),
 }
 """Limits of the numbers outside of `env` (those have theirs in `envs.limits`), both ends included."""
 
@@ -81,6 +86,9 @@ class TrainConfig:
     """Go on with the run in that folder, with the settings it was started with."""
     init: str = ""
     """Run folder or policy file whose parameters and normaliser to start from."""
+    init_spread: float = 1.0
+    """Factor on the spread with which the policy that `init` names explores: one that walks, but on narrow footholds
+    stumbles over its own exploration, goes on better with less."""
     devices: int = 0
     """Devices to use; 0: all of them."""
     coordinator: str = ""
@@ -351,6 +359,8 @@ def validate(config: TrainConfig) -> None:
         )
     if config.coordinator and not config.run:
         raise UsageError("with coordinator= set run=, the same folder in every process")
+    if config.init_spread != 1.0 and not config.init:
+        raise UsageError("init_spread needs init=, a run folder or policy file")
     if config.num_envs % config.ppo.minibatches:
         raise UsageError(
             f"num_envs={config.num_envs} must be a multiple of ppo.minibatches={config.ppo.minibatches}"
@@ -382,7 +392,7 @@ def load_config(path: Path) -> TrainConfig:
         # Merged into the schema, which gives every value its type.
         schema = OmegaConf.structured(default_config())
         _writable(schema)
-        found = OmegaConf.merge({"env": {"tg": tg.BEFORE}}, OmegaConf.load(path))
+        found = OmegaConf.merge({"env": {"tg": tg.BEFORE}, "policy": BEFORE_NETWORKS}, OmegaConf.load(path))
         return build(TrainConfig, OmegaConf.to_container(OmegaConf.merge(schema, found)))
     except (
         OmegaConfBaseException,

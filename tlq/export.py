@@ -73,7 +73,7 @@ def write(
         raise ValueError(
             f"the normaliser is for {kept[_MEAN].size} observed values, the environment shows {size}"
         )
-    if f"{_PARAMS}leg_action.kernel" in kept:
+    if any(n.endswith("leg_action.kernel") for n in kept):
         kept["leg_sign"] = LEG_SIGN
     nodes = policy_graph(config.policy, kept, heights=100 if config.env.method != "blind" else 0)
     Graph(nodes, kept)
@@ -247,7 +247,7 @@ def policy_graph(policy: Any, arrays: Mapping[str, np.ndarray], heights: int) ->
         proprio = b.add("Slice", normal, axes=[-1], starts=[0], ends=[size - heights])
         foot = b.add("Slice", "observation", axes=[-1], starts=[size - heights], ends=[size])
         foot = b.add("Gather", foot, axis=-1, indices=SAME_SIDE.tolist())
-        foot = b.add("Reshape", foot, shape=[policy.feet, heights // policy.feet])
+        foot = raw = b.add("Reshape", foot, shape=[policy.feet, heights // policy.feet])
         for i in range(len(policy.foot_encoder)):
             foot = b.elu(f"foot_{i}", foot)
         flat = b.add("Reshape", foot, shape=[policy.feet * policy.foot_encoder[-1]])
@@ -266,8 +266,27 @@ def policy_graph(policy: Any, arrays: Mapping[str, np.ndarray], heights: int) ->
         leg = b.dense("leg_action", b.elu("leg", b.add("Concat", foot, context, axis=-1)))
         leg = b.add("Reshape", b.add("Mul", leg, "leg_sign"), shape=[actions - 2])
         mean = b.add("Concat", shared, b.add("Add", residuals, leg), axis=-1)
+    if heights and policy.foothold_head:
+        shared, residuals = b.split(mean, 2, actions - 2)
+        mean = b.add("Concat", shared, b.add("Add", residuals, _footholds(b, policy, proprio, raw)), axis=-1)
     b.add("Tanh", mean, outputs=("action",))
     return b.nodes
+
+
+def _footholds(b: _Builder, policy: Any, proprio: str, foot: str) -> str:
+    """`tlq.networks.Footholds`; foot: the heights (4, 25) of the feet."""
+    for i in range(len(policy.foot_encoder)):
+        foot = b.elu(f"footholds.foot_{i}", foot)
+    width = policy.foot_encoder[-1]
+    order = np.arange(policy.feet * width).reshape(policy.feet, width)[::-1].reshape(-1)
+    flat = b.add("Reshape", foot, shape=[policy.feet * width])
+    across = b.add("Gather", flat, axis=-1, indices=order.tolist())
+    across = b.add("Reshape", across, shape=[policy.feet, width])
+    context = b.dense("footholds.to_legs", b.elu("footholds.proprio", proprio))
+    context = b.add("Reshape", context, shape=[policy.feet, policy.leg_context])
+    leg = b.elu("footholds.leg", b.add("Concat", foot, across, context, axis=-1))
+    leg = b.add("Mul", b.dense("footholds.leg_action", leg), "leg_sign")
+    return b.add("Reshape", leg, shape=[3 * policy.feet])
 
 
 def _add_memory(b: _Builder, policy: Any, y: str) -> str:

@@ -73,7 +73,7 @@ def ppo_loss(
     by_env = jax.vmap(lambda p, key: distribution.entropy({"action": p}, key), in_axes=(1, 0), out_axes=1)
     entropy_loss = -config.entropy * jnp.mean(by_env(parameters["action"], keys))
     guide_loss = jnp.float32(0)
-    if rollout.guide is not None:
+    if rollout.guide is not None and networks.footholds is None:
         mean = jnp.tanh(jnp.split(parameters["action"], 2, axis=-1)[0])
         guide_loss = jnp.mean(guide.cost(rollout.guide, mean))
     total = policy_loss + value_loss + entropy_loss + config.guide * guide_loss

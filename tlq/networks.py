@@ -8,6 +8,7 @@ import dataclasses
 from collections.abc import Callable
 from typing import Any
 
+import flax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -36,6 +37,10 @@ LEG_SIGN = np.array([[1, 1, 1], [-1, 1, 1]] * 2, np.float32)
 """(4, 3) turns a left leg's residuals (abduction, hip, knee) into the same leg's."""
 
 
+BEFORE = {"foothold_head": 0}
+"""Settings that older runs don't name, as they were."""
+
+
 @dataclasses.dataclass(frozen=True)
 class NetworkConfig:
     """Sizes of policy and critic."""
@@ -61,6 +66,9 @@ class NetworkConfig:
     """Hidden widths of the critic."""
     initial_std: float = 0.3
     """Standard deviation of the action, before tanh, of an untrained policy."""
+    foothold_head: int = 64
+    """Width of the layers of a network of its own that adds to the residuals what leads feet to footholds; where the
+    terrain has pits the scripted guide teaches it. 0: none."""
     feet: int = 4
     """Feet whose heights stand at the end of the observation."""
 
@@ -109,6 +117,37 @@ def _head_bias(initial_std: float) -> Callable[..., jax.Array]:
     return init
 
 
+def _by_foot(heights: jax.Array, feet: int) -> jax.Array:
+    """Heights (.., 100) foot by foot (.., 4, 25), the right ones in the mirror."""
+    return heights[..., SAME_SIDE].reshape(*heights.shape[:-1], feet, heights.shape[-1] // feet)
+
+
+class Footholds(nn.Module):
+    """What leads feet to footholds: normalised proprioception and heights -> residual actions before tanh.
+
+    It has no memory and shares nothing with the rest of the policy, so that it can be taught apart and faster.
+    """
+
+    config: NetworkConfig
+
+    @nn.compact
+    def __call__(self, proprio: jax.Array, heights: jax.Array) -> jax.Array:
+        """proprio (.., S - 100), heights (.., 100) -> (.., 12)."""
+        c = self.config
+        foot = _by_foot(heights, c.feet)
+        for i, width in enumerate(c.foot_encoder):
+            foot = nn.elu(Dense(width, name=f"foot_{i}")(foot))
+        # A trot swings a leg together with the one across.
+        across = foot[..., ::-1, :]
+        context = nn.elu(Dense(c.foothold_head, name="proprio")(proprio))
+        context = Dense(c.feet * c.leg_context, name="to_legs")(context)
+        context = context.reshape(*foot.shape[:-1], c.leg_context)
+        leg = nn.elu(Dense(c.foothold_head, name="leg")(jnp.concatenate([foot, across, context], axis=-1)))
+        small = nn.initializers.variance_scaling(0.01**2, "fan_in", "truncated_normal")
+        leg = Dense(3, kernel_init=small, name="leg_action")(leg) * LEG_SIGN
+        return leg.reshape(*leg.shape[:-2], 3 * c.feet)
+
+
 class Policy(nn.Module):
     """Encoders, memory, head: normalised proprioception and heights -> parameters of the action distribution."""
 
@@ -128,8 +167,7 @@ class Policy(nn.Module):
         x = nn.elu(Dense(c.encoder, name="proprio")(proprio))
         foot = None
         if heights is not None:
-            heights = heights[..., SAME_SIDE]
-            foot = heights.reshape(*heights.shape[:-1], c.feet, heights.shape[-1] // c.feet)
+            foot = _by_foot(heights, c.feet)
             for i, width in enumerate(c.foot_encoder):
                 foot = nn.elu(Dense(width, name=f"foot_{i}")(foot))
             # The feet are told apart here: each has its own place in the input of `mix`.
@@ -153,6 +191,10 @@ class Policy(nn.Module):
             rest = [(0, 0)] * (action.ndim - 1)
             leg = leg.reshape(*leg.shape[:-2], 3 * c.feet)
             action = action + jnp.pad(leg, [*rest, (2, 2 * self.action_size - 2 - 3 * c.feet)])
+        if heights is not None and c.foothold_head:
+            residuals = Footholds(c, name="footholds")(proprio, heights)
+            rest = [(0, 0)] * (action.ndim - 1)
+            action = action + jnp.pad(residuals, [*rest, (2, 2 * self.action_size - 2 - 3 * c.feet)])
         return {"action": action, "carry": carry}
 
 
@@ -168,6 +210,14 @@ class Critic(nn.Module):
         for i, width in enumerate(self.widths):
             x = nn.elu(Dense(width, name=f"hidden_{i}")(x))
         return Dense(1, name="value")(x)[..., 0]
+
+
+@flax.struct.dataclass
+class Networks(PPONetworks):
+    """Brax's, and the part of the policy that leads feet to footholds, by itself."""
+
+    footholds: Callable[..., jax.Array] | None = None
+    """(normaliser, its parameters, 'state' (.., S)) -> (.., 12) residual actions before tanh; None without heights."""
 
 
 def _size(shape: Any) -> int:
@@ -190,7 +240,7 @@ def make_networks(
     *,
     config: NetworkConfig = NetworkConfig(),
     heights: int = 100,
-) -> PPONetworks:
+) -> Networks:
     """Network factory with Brax's signature.
 
     observation_size: {'state': S, 'privileged_state': V, ...}, each a number or a shape. `heights`: how many of the
@@ -217,7 +267,12 @@ def make_networks(
             params, _normalised(preprocess_observations_fn, statistics, obs, "privileged_state")
         )
 
-    return PPONetworks(
+    def footholds_apply(statistics: Any, params: Any, state: jax.Array) -> jax.Array:
+        proprio, _ = split(_normalised(preprocess_observations_fn, statistics, {"state": state}, "state"))
+        return Footholds(config).apply({"params": params}, proprio, split(state)[1])
+
+    return Networks(
+        footholds=footholds_apply if heights and config.foothold_head else None,
         policy_network=FeedForwardNetwork(init=policy_init, apply=policy_apply),
         value_network=FeedForwardNetwork(
             init=lambda key: critic.init(key, jnp.zeros((1, value_size))), apply=value_apply

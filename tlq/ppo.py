@@ -19,17 +19,21 @@ import optax
 from brax.envs.base import Env, State
 from brax.training.acme import running_statistics
 from brax.training.agents.ppo.losses import PPONetworkParams
-from brax.training.agents.ppo.networks import PPONetworks
 from jax.sharding import Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
 
-from envs import Guidance
+from envs import Guidance, guide
 from tlq.loss import ppo_loss
+from tlq.networks import Networks
 
 AXIS = "data"
 NORMALISED = ("state", "privileged_state")
 STREAMS = 16
 """Groups of environments that are shuffled each by itself: a minibatch doesn't depend on the number of devices."""
+
+
+STRIDE = 5
+"""A minibatch of the guide has every fifth step of its environments: their neighbours say nearly the same."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,6 +71,10 @@ class PPOConfig:
     guide: float = 4.0
     """Weight of what footholds cost by the scripted guide (envs/guide.py) where the terrain has pits; 0: the policy
     learns them by reward alone."""
+    guide_rate: float = 1e-3
+    """Adam's learning rate of the part of the policy that leads feet to footholds, while the guide teaches it."""
+    guide_epochs: int = 2
+    """Passes over the data of an iteration in which the guide teaches it."""
 
 
 @flax.struct.dataclass
@@ -133,7 +141,7 @@ class Learner:
     """
 
     def __init__(
-        self, env: Env, networks: PPONetworks, config: PPOConfig, num_envs: int, mesh: Mesh | None = None
+        self, env: Env, networks: Networks, config: PPOConfig, num_envs: int, mesh: Mesh | None = None
     ):
         self.env, self.networks, self.config, self.num_envs = env, networks, config, num_envs
         self.mesh = mesh or make_mesh()
@@ -231,7 +239,7 @@ class Learner:
         seen = {name: jnp.zeros(env_state.obs[name].shape[1:]) for name in NORMALISED}
         state = TrainState(
             params=params,
-            opt_state=self._optimiser.init(params),
+            opt_state=(self._optimiser.init(params), self._optimiser.init(self._footholds(params))),
             learning_rate=jnp.float32(self.config.learning_rate),
             normaliser=running_statistics.init_state(seen, std_eps=1e-4),
             env_state=env_state,
@@ -240,6 +248,10 @@ class Learner:
         )
         # Strong types throughout: with a weak one in the environment's state the second call would compile again.
         return jax.tree.map(lambda x: jax.lax.convert_element_type(x, jnp.asarray(x).dtype), state)
+
+    def _footholds(self, params: PPONetworkParams) -> Any:
+        """The parameters that the guide teaches; none if there is no such part."""
+        return params.policy["params"].get("footholds", {})
 
     # -- one iteration, on each device ---------------------------------------------------------------------------------
 
@@ -312,9 +324,9 @@ class Learner:
         here = self.num_envs // self.devices
         return jax.lax.axis_index(AXIS) * here + jnp.arange(here)
 
-    def _minibatches(self, key: jax.Array) -> jax.Array:
+    def _minibatches(self, key: jax.Array, config: PPOConfig | None = None) -> jax.Array:
         """This device's environments (epochs x M, B / M), shuffled stream by stream anew in each pass."""
-        c, here = self.config, self.streams // self.devices
+        c, here = config or self.config, self.streams // self.devices
         size = self.num_envs // self.streams
 
         def order(stream: jax.Array) -> jax.Array:
@@ -334,16 +346,17 @@ class Learner:
         carry: (B, C) from before the first step; last: (B, V) 'privileged_state' after the last.
         """
         c = self.config
-        key_order, key_loss = jax.random.split(key)
+        key_order, key_loss, key_teach = jax.random.split(key, 3)
         chosen, numbers = self._minibatches(key_order), self._numbers()
+        taught = rollout.guide is not None and self.networks.footholds is not None
 
         def gradient_step(carried, inputs):
             params, opt_state = carried
             index, key = inputs
             batch = jax.tree.map(lambda x: x[:, index], rollout)
-            (_, losses), grads = jax.value_and_grad(self._loss, has_aux=True)(
-                params, state.normaliser, batch, carry[index], last[index], _keys(key, numbers[index])
-            )
+            (_, losses), grads = jax.value_and_grad(
+                lambda p, *rest: self._loss(_frozen(p) if taught else p, *rest), has_aux=True
+            )(params, state.normaliser, batch, carry[index], last[index], _keys(key, numbers[index]))
             grads, losses = jax.lax.pmean((grads, losses), AXIS)
             updates, opt_state = self._optimiser.update(grads, opt_state)
             params = optax.apply_updates(params, jax.tree.map(lambda u: -state.learning_rate * u, updates))
@@ -351,10 +364,68 @@ class Learner:
 
         (params, opt_state), losses = jax.lax.scan(
             gradient_step,
-            (state.params, state.opt_state),
+            (state.params, state.opt_state[0]),
             (chosen, jax.random.split(key_loss, c.epochs * c.minibatches)),
         )
-        return params, opt_state, _loss_metrics(losses, c.minibatches)
+        figures, teach_state = _loss_metrics(losses, c.minibatches), state.opt_state[1]
+        if taught:
+            params, teach_state, cost = self._teach(state, params, rollout, key_teach)
+            figures["loss/guide"] = cost
+        return params, (opt_state, teach_state), figures
+
+    def _teach(
+        self, state: TrainState, params: PPONetworkParams, rollout: Rollout, key: jax.Array
+    ) -> tuple[PPONetworkParams, Any, jax.Array]:
+        """Gradient steps by which the policy's footholds cost less; the rest of it stays as it is.
+
+        Returns parameters, the optimiser's state, and the mean cost () in the last pass.
+        """
+        c, footholds = self.config, self.networks.footholds
+        assert footholds is not None and rollout.guide is not None
+        policy = params.policy["params"]
+        old = jax.lax.map(
+            lambda x: footholds(state.normaliser, self._footholds(state.params), x),
+            rollout.observation["state"],
+        )
+        rest = rollout.parameters[..., : self.env.action_size] - jnp.pad(old, ((0, 0), (0, 0), (2, 0)))
+        data = {"state": rollout.observation["state"], "rest": rest, "guide": rollout.guide}
+        stride = math.gcd(STRIDE, c.unroll)
+        every = dataclasses.replace(c, epochs=c.guide_epochs)
+        chosen = self._minibatches(key, every)
+        chosen = jnp.repeat(chosen, stride, axis=0)
+        offsets = jnp.tile(jnp.arange(stride), chosen.shape[0] // stride)
+        times = jnp.arange(c.unroll // stride) * stride
+
+        def loss(own: Any, batch: dict[str, Any]) -> jax.Array:
+            residuals = footholds(state.normaliser, own, batch["state"])
+            mean = batch["rest"] + jnp.pad(residuals, ((0, 0), (0, 0), (2, 0)))
+            return jnp.mean(
+                guide.cost(batch["guide"], jnp.tanh(mean)) + guide.idle(batch["guide"], residuals)
+            )
+
+        def gradient_step(carried, inputs):
+            own, opt_state = carried
+            index, offset = inputs
+            batch = jax.tree.map(lambda x: x[(times + offset)[:, None], index], data)
+            cost, grads = jax.value_and_grad(loss)(own, batch)
+            cost, grads = jax.lax.pmean((cost, grads), AXIS)
+            updates, opt_state = self._optimiser.update(grads, opt_state)
+            own = optax.apply_updates(own, jax.tree.map(lambda u: -c.guide_rate * u, updates))
+            return (own, opt_state), cost
+
+        (own, opt_state), costs = jax.lax.scan(
+            gradient_step, (self._footholds(state.params), state.opt_state[1]), (chosen, offsets)
+        )
+        params = params.replace(policy={"params": dict(policy, footholds=own)})
+        return params, opt_state, jnp.mean(costs[-stride * c.minibatches :])
+
+
+def _frozen(params: PPONetworkParams) -> PPONetworkParams:
+    """Parameters of which those of the footholds get no gradient: to PPO they are part of the world."""
+    policy = params.policy["params"]
+    return params.replace(
+        policy={"params": dict(policy, footholds=jax.lax.stop_gradient(policy["footholds"]))}
+    )
 
 
 def _keys(key: jax.Array, numbers: jax.Array) -> jax.Array:

@@ -214,11 +214,15 @@ def initialise(state: TrainState, source: str, config: TrainConfig | None = None
         ratio = before.tg.residual_range / config.env.tg.residual_range
         if ratio != 1.0:
             arrays = rescale_residuals(arrays, ratio)
+    if config is not None and config.init_spread != 1.0:
+        arrays = rescale_spread(arrays, config.init_spread)
     parts = {"params": state.params, "normaliser": state.normaliser}
     taken = []
 
     def take(name: str, x: jax.Array) -> jax.Array:
         new = arrays.get(name)
+        if new is None and ".footholds." in name:
+            return x  # a policy from before it had them
         if new is None or new.shape != x.shape:
             if name.startswith("params.policy"):
                 has = "missing" if new is None else f"of shape {new.shape}"
@@ -232,6 +236,8 @@ def initialise(state: TrainState, source: str, config: TrainConfig | None = None
         # The critic sees other things than it did: its normaliser is measured anew, see `measure_rest`.
         arrays = {k: v for k, v in arrays.items() if not k.startswith("normaliser.count")}
     flat = [take(n, x) for n, x in zip(names(parts), jax.tree.leaves(parts), strict=True)]
+    if any(".footholds." in name for name in arrays) and "footholds" not in state.params.policy["params"]:
+        raise ValueError(f"init={source} doesn't fit: it has a part for footholds; set policy.foothold_head")
     parts = jax.tree.unflatten(jax.tree.structure(parts), flat)
     print(f"init: {len(taken)} of {len(flat)} arrays from {source}", flush=True)
     return dataclasses.replace(state, params=parts["params"], normaliser=parts["normaliser"])
@@ -266,6 +272,19 @@ def rescale_residuals(arrays: dict[str, np.ndarray], ratio: float) -> dict[str, 
             x[seen] *= ratio**2
         else:
             continue
+        arrays[name] = x
+    return arrays
+
+
+def rescale_spread(arrays: dict[str, np.ndarray], factor: float) -> dict[str, np.ndarray]:
+    """A policy's parameters with `factor` times the standard deviation of its actions before tanh.
+
+    Where the policy's spread differs from state to state that holds as long as it is well below 1.
+    """
+    arrays, name = dict(arrays), "params.policy.params.action.bias"
+    if name in arrays:
+        x = np.array(arrays[name])
+        x[tg.ACTION_SIZE :] = np.log(np.expm1(factor * np.logaddexp(x[tg.ACTION_SIZE :], 0.0)))
         arrays[name] = x
     return arrays
 

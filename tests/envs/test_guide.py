@@ -187,9 +187,28 @@ def slow_cost(guidance, action):
         inside = np.clip(led, axis[0], axis[-1])
         gap = interpolate.RegularGridInterpolator((axis, axis), gaps.astype(float))(inside)[0]
         away = np.linalg.norm(led - guidance.ahead)
-        total += weight * (gap + guide.FARTHER * away + guide.BEYOND * np.abs(led - inside).sum())
+        total += weight * (guide.GAP * gap + guide.FARTHER * away + guide.BEYOND * np.abs(led - inside).sum())
         middle += (led - guidance.ahead) / 2
     return total + guidance.weight.min() * guide.ACROSS * abs(middle @ guidance.across)
+
+
+def test_legs_that_nothing_is_asked_of_cost_by_what_they_are_moved():
+    random = np.random.default_rng(0)
+    for _ in range(20):
+        weight, hold = random.uniform(0, 1, 2), random.uniform(0, 1, 4) * (random.uniform(size=4) < 0.5)
+        legs = random.permutation(4)[:2]
+        residual = random.normal(size=12)
+        expected = 0.0
+        for leg in range(4):
+            asked = max([hold[leg], *(w for w, which in zip(weight, legs, strict=True) if which == leg)])
+            moved = sum(residual[3 * leg + joint] ** 2 for joint in range(3))
+            expected += (guide.ALWAYS + guide.IDLE * (1 - asked)) * moved
+        nothing = dict.fromkeys(guide.Guidance._fields)
+        guidance = guide.Guidance(
+            **nothing | {"legs": jnp.asarray(legs), "weight": jnp.asarray(weight), "hold": jnp.asarray(hold)}
+        )
+        found = guide.idle(guidance, jnp.asarray(residual, jnp.float32))
+        np.testing.assert_allclose(found, expected, rtol=1e-5)
 
 
 def test_cost_against_a_loop():

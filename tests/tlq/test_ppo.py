@@ -32,8 +32,8 @@ B = 32
 KEY = jax.random.PRNGKey(0)
 
 
-def make_learner(memory="mingru", config=CONFIG, env=None, devices=1):
-    c = dataclasses.replace(NETWORKS, memory=memory)
+def make_learner(memory="mingru", config=CONFIG, env=None, devices=1, **networks):
+    c = dataclasses.replace(NETWORKS, memory=memory, **networks)
     env = env or ToyEnv(length=5)
     wrapped = RecurrentWrapper(VmapWrapper(env), carry_size(c.memory, c.memory_layers, c.memory_width))
     networks = make_networks(env.observation_size, ACTIONS, config=c)
@@ -191,9 +191,10 @@ class Asking(Wrapper):
 
 
 @pytest.mark.slow
-def test_a_policy_learns_where_its_guide_sees_ground():
-    config = dataclasses.replace(CONFIG, guide=30.0, learning_rate=3e-3, epochs=4)
-    learner = make_learner(config=config, env=Asking(ToyEnv(length=5)))
+@pytest.mark.parametrize("head", [0, 16])
+def test_a_policy_learns_where_its_guide_sees_ground(head):
+    config = dataclasses.replace(CONFIG, guide=30.0, learning_rate=3e-3, epochs=4, guide_rate=3e-3)
+    learner = make_learner(config=config, env=Asking(ToyEnv(length=5)), foothold_head=head)
     state = learner.init(0)
     losses = []
     for _ in range(12):
@@ -211,6 +212,52 @@ def test_a_policy_learns_where_its_guide_sees_ground():
     # What a failed update would leave.
     batch = learner.batch(state)
     assert batch["guide_lead"].shape == (12, B, 4, 2, 4) and batch["guide_hold"].shape == (12, B, 4)
+
+
+@pytest.mark.slow
+def test_the_guide_teaches_the_footholds_and_reward_the_rest():
+    """Each at its own rate; and without a guide reward teaches everything."""
+
+    def changed(learner):
+        first = learner.init(0)
+        looked, _ = learner.step(first)
+        after, metrics = learner.step(looked)
+        before, after = (x.params.policy["params"] for x in (looked, after))
+        moved = {
+            name: max(
+                float(jnp.abs(a - b).max())
+                for a, b in zip(*map(jax.tree.leaves, (x, before[name])), strict=True)
+            )
+            for name, x in after.items()
+        }
+        return moved, metrics, learner, looked
+
+    guided = Asking(ToyEnv(length=5))
+    config = dataclasses.replace(CONFIG, learning_rate=1e-3, guide_rate=0.0)
+    by_reward, metrics, learner, state = changed(make_learner(config=config, env=guided))
+    assert by_reward.pop("footholds") == 0 and min(by_reward.values()) > 0
+    # What PPO compares was drawn with the same footholds: nothing has changed yet.
+    assert abs(float(metrics["kl"])) < 1e-6
+    _, rollout, _ = rollout_of(learner, state)
+    networks = learner.networks
+    residual = networks.footholds(
+        state.normaliser, state.params.policy["params"]["footholds"], rollout.observation["state"]
+    )
+    without = jax.tree.map(jnp.zeros_like, state.params.policy["params"]["footholds"])
+    policy = {"params": dict(state.params.policy["params"], footholds=without)}
+    carry = state.env_state.obs["carry"]
+    rest = networks.policy_network.apply(
+        state.normaliser, policy, dict(rollout.observation, carry=carry[None])
+    )
+    np.testing.assert_allclose(rest["action"][..., 2:14] + residual, rollout.parameters[..., 2:14], atol=2e-6)
+
+    config = dataclasses.replace(CONFIG, learning_rate=0.0, guide_rate=1e-3, epochs=1)
+    by_guide, _, _, _ = changed(make_learner(config=config, env=guided))
+    assert by_guide.pop("footholds") > 5e-4 and max(by_guide.values()) == 0
+
+    config = dataclasses.replace(CONFIG, learning_rate=1e-3, guide_rate=0.0)
+    unguided, _, _, _ = changed(make_learner(config=config))
+    assert min(unguided.values()) > 0
 
 
 def test_constants_become_arguments():

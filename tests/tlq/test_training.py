@@ -28,6 +28,7 @@ from tlq.training import (
     make_learner,
     measure_rest,
     rescale_residuals,
+    rescale_spread,
     train,
 )
 
@@ -209,6 +210,37 @@ def test_a_run_can_start_from_a_policy_file(run, learner, tmp_path):
         after.normaliser.std["state"], arrays["normaliser.std.state"], rtol=0.05, atol=0.02
     )
     np.testing.assert_allclose(after.normaliser.mean["privileged_state"][0], 0.0, atol=1.0)
+
+
+def test_a_policy_is_started_with_less_exploration():
+    networks = make_networks({"state": (188,), "privileged_state": (232,)}, 14, config=NetworkConfig())
+    policy = networks.policy_network.init(jax.random.PRNGKey(0))
+    random = np.random.default_rng(0)
+    policy["params"]["action"]["kernel"] = jnp.asarray(random.normal(size=(64, 28)) * 0.05)
+    before = {
+        "params.policy.params.action.bias": policy["params"]["action"]["bias"],
+        "another": np.ones(3),
+    }
+    after = rescale_spread(before, 0.5)
+    np.testing.assert_array_equal(after.pop("another"), np.ones(3))
+    narrow = jax.tree.map(jnp.array, policy)
+    (narrow["params"]["action"]["bias"],) = map(jnp.asarray, after.values())
+    observation = {
+        "state": jnp.asarray(random.normal(size=(50, 188)), jnp.float32),
+        "carry": jnp.zeros((50, 128)),
+        "is_first": jnp.ones((50, 1)),
+    }
+    identity = make_networks(
+        {"state": (188,), "privileged_state": (232,)}, 14, lambda x, _: x, config=NetworkConfig()
+    )
+    mean, std = {}, {}
+    for name, parameters in (("before", policy), ("after", narrow)):
+        found = identity.policy_network.apply(None, parameters, observation)
+        distribution = identity.parametric_action_distribution.create_dist(found)
+        mean[name], std[name] = np.asarray(distribution.loc), np.asarray(distribution.scale)
+    np.testing.assert_array_equal(mean["after"], mean["before"])
+    np.testing.assert_allclose(std["after"], 0.5 * std["before"], rtol=0.1)
+    assert std["before"].std(axis=0).max() > 0.01  # it differs from state to state
 
 
 def test_parameters_of_other_sizes_are_refused(learner, tmp_path):
