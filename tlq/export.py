@@ -266,7 +266,7 @@ def policy_graph(policy: Any, arrays: Mapping[str, np.ndarray], heights: int) ->
         leg = b.dense("leg_action", b.elu("leg", b.add("Concat", foot, context, axis=-1)))
         leg = b.add("Reshape", b.add("Mul", leg, "leg_sign"), shape=[actions - 2])
         mean = b.add("Concat", shared, b.add("Add", residuals, leg), axis=-1)
-    if heights and policy.foothold_head:
+    if f"{_PARAMS}footholds.leg.kernel" in arrays:
         shared, residuals = b.split(mean, 2, actions - 2)
         mean = b.add("Concat", shared, b.add("Add", residuals, _footholds(b, policy, proprio, raw)), axis=-1)
     b.add("Tanh", mean, outputs=("action",))

@@ -67,8 +67,8 @@ class NetworkConfig:
     initial_std: float = 0.3
     """Standard deviation of the action, before tanh, of an untrained policy."""
     foothold_head: int = 64
-    """Width of the layers of a network of its own that adds to the residuals what leads feet to footholds; where the
-    terrain has pits the scripted guide teaches it. 0: none."""
+    """Width of the layers of a network of its own that adds to the residuals what leads feet to footholds. There is one
+    where the terrain has pits and a scripted guide teaches it (`ppo.guide`). 0: none."""
     feet: int = 4
     """Feet whose heights stand at the end of the observation."""
 

@@ -346,7 +346,7 @@ class Learner:
         carry: (B, C) from before the first step; last: (B, V) 'privileged_state' after the last.
         """
         c = self.config
-        key_order, key_loss, key_teach = jax.random.split(key, 3)
+        key_order, key_loss = jax.random.split(key)
         chosen, numbers = self._minibatches(key_order), self._numbers()
         taught = rollout.guide is not None and self.networks.footholds is not None
 
@@ -369,6 +369,7 @@ class Learner:
         )
         figures, teach_state = _loss_metrics(losses, c.minibatches), state.opt_state[1]
         if taught:
+            key_teach = jax.random.fold_in(key, 2)
             params, teach_state, cost = self._teach(state, params, rollout, key_teach)
             figures["loss/guide"] = cost
         return params, (opt_state, teach_state), figures

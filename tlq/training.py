@@ -43,16 +43,19 @@ def wrap(env: Env, config: TrainConfig) -> Env:
 
 def make_learner(config: TrainConfig, env: Env | None = None, heights: int | None = None) -> Learner:
     """Learner of `config`; env: a single auto-resetting instance, by default the quadruped of `config.env`."""
-    if env is None:
-        import envs
+    import envs
 
+    if env is None:
         made = envs.make(config.env)
         env = envs.AutoReset(made)
         if config.ppo.guide and made.has_pits:
             env = envs.Guided(env)
     if heights is None:
         heights = 0 if config.env.method == "blind" else 100
-    networks = make_networks(env.observation_size, env.action_size, config=config.policy, heights=heights)
+    policy = config.policy
+    if not isinstance(env, envs.Guided):  # nobody would teach that part of it
+        policy = dataclasses.replace(policy, foothold_head=0)
+    networks = make_networks(env.observation_size, env.action_size, config=policy, heights=heights)
     return Learner(wrap(env, config), networks, config.ppo, config.num_envs, make_mesh(config.devices))
 
 
@@ -237,7 +240,8 @@ def initialise(state: TrainState, source: str, config: TrainConfig | None = None
         arrays = {k: v for k, v in arrays.items() if not k.startswith("normaliser.count")}
     flat = [take(n, x) for n, x in zip(names(parts), jax.tree.leaves(parts), strict=True)]
     if any(".footholds." in name for name in arrays) and "footholds" not in state.params.policy["params"]:
-        raise ValueError(f"init={source} doesn't fit: it has a part for footholds; set policy.foothold_head")
+        needs = "terrain with pits, ppo.guide and policy.foothold_head"
+        raise ValueError(f"init={source} doesn't fit: it has a part for footholds, which needs {needs}")
     parts = jax.tree.unflatten(jax.tree.structure(parts), flat)
     print(f"init: {len(taken)} of {len(flat)} arrays from {source}", flush=True)
     return dataclasses.replace(state, params=parts["params"], normaliser=parts["normaliser"])
