@@ -29,6 +29,7 @@ import terrains  # noqa: E402
 from benchmarks import timing  # noqa: E402
 from envs import guide  # noqa: E402
 from envs.env import exact_sensors  # noqa: E402
+from envs.limits import check_values  # noqa: E402
 from tlq import cli  # noqa: E402
 from tlq import config as settings  # noqa: E402
 from tlq.ppo import AXIS, hoist  # noqa: E402
@@ -187,7 +188,7 @@ def main(arguments: Sequence[str]) -> None:
     """Prints the shares, and writes the JSON."""
     options = cli.parse(Options, arguments, __doc__ or "")
     cli.check_folders(options, "json")
-    timing.check(options)
+    check_values(dataclasses.asdict(options), timing.LIMITS)
     settings.use_cache(settings.TrainConfig().cache)
     timing.put_out(measure(options), dataclasses.asdict(options), options.json)
 

@@ -37,6 +37,7 @@ import numpy as np  # noqa: E402
 import envs  # noqa: E402
 import terrains  # noqa: E402
 from benchmarks import timing  # noqa: E402
+from envs.limits import check_values  # noqa: E402
 from envs.robot import robot_spec  # noqa: E402
 from tlq import cli  # noqa: E402
 from tlq import config as settings  # noqa: E402
@@ -265,7 +266,7 @@ def main(arguments: Sequence[str]) -> None:
     """Prints the JSON."""
     options = cli.parse(Options, arguments, __doc__ or "")
     cli.check_folders(options, "json")
-    timing.check(options)
+    check_values(dataclasses.asdict(options), timing.LIMITS)
     settings.use_cache(settings.TrainConfig().cache)
     result = compare(options)
     if options.scaling:

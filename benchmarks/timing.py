@@ -16,14 +16,8 @@ from jax.sharding import PartitionSpec as P
 from tlq.files import whole
 from tlq.ppo import AXIS, Learner
 
-COUNTS = ("rounds", "num_envs", "num_terrains", "unroll", "most_envs")
-
-
-def check(options: Any) -> None:
-    """Raises ValueError where a number of the command line that counts something is less than 1."""
-    for name in COUNTS:
-        if getattr(options, name, 1) < 1:
-            raise ValueError(f"{name}={getattr(options, name)} must be 1 or more")
+LIMITS = {"rounds": (1, 1000)}
+"""Of a number that the configuration of training doesn't check."""
 
 
 def medians(functions: Mapping[str, Callable[[], Any]], rounds: int) -> dict[str, float]:

@@ -19,6 +19,14 @@ def result(name, arguments, folder):
     return json.loads((folder / "result.json").read_text())
 
 
+@pytest.mark.parametrize("name", ["breakdown", "throughput"])
+def test_no_rounds_are_refused_before_anything_is_built(name):
+    command = [sys.executable, "-m", f"benchmarks.{name}", "rounds=0"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300, check=False)
+    assert done.returncode == 2
+    assert done.stderr.splitlines()[-1] == "error: rounds=0 must be from 1 to 1000"
+
+
 @pytest.mark.slow
 def test_breakdown(tmp_path):
     shares = result("breakdown", [*SMALL, "unroll=2", "warm_up=1"], tmp_path)["share_of_iteration"]

@@ -57,9 +57,9 @@ LIMITS: dict[str, tuple[float, float]] = {
     "ppo.max_grad_norm": (1e-6, 1e6),
     "ppo.reward_scaling": (1e-6, 1e6),
     "ppo.guide": (0.0, 1e3),
-    "init_spread": (0.01, 100.0),
     "ppo.guide_rate": (0.0, 1.0),
     "ppo.guide_epochs": (1, 1000),
+    "init_spread": (0.01, 100.0),
 }
 """Limits of the numbers outside of `env` (those have theirs in `envs.limits`), both ends included."""
 

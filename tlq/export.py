@@ -238,7 +238,7 @@ def policy_graph(policy: Any, arrays: Mapping[str, np.ndarray], heights: int) ->
       arrays: initialisers, for their shapes.
       heights: how many of the last entries of the observation are heights (not normalised).
     """
-    from tlq.networks import CLIP, SAME_SIDE
+    from tlq.networks import CLIP, RESIDUALS, SAME_SIDE
 
     b, size = _Builder(), arrays[_MEAN].size
     normal = b.add("Div", b.add("Sub", "observation", _MEAN), _STD)
@@ -247,7 +247,7 @@ def policy_graph(policy: Any, arrays: Mapping[str, np.ndarray], heights: int) ->
         proprio = b.add("Slice", normal, axes=[-1], starts=[0], ends=[size - heights])
         foot = b.add("Slice", "observation", axes=[-1], starts=[size - heights], ends=[size])
         foot = b.add("Gather", foot, axis=-1, indices=SAME_SIDE.tolist())
-        foot = raw = b.add("Reshape", foot, shape=[policy.feet, heights // policy.feet])
+        foot = heights_by_foot = b.add("Reshape", foot, shape=[policy.feet, heights // policy.feet])
         for i in range(len(policy.foot_encoder)):
             foot = b.elu(f"foot_{i}", foot)
         flat = b.add("Reshape", foot, shape=[policy.feet * policy.foot_encoder[-1]])
@@ -260,15 +260,16 @@ def policy_graph(policy: Any, arrays: Mapping[str, np.ndarray], heights: int) ->
     y = b.elu("head", b.add("Concat", x, y, axis=-1))
     actions = arrays[f"{_PARAMS}action.bias"].size // 2
     mean, _ = b.split(b.dense("action", y), actions, actions)
+    added = []
     if heights and policy.leg_head:
-        shared, residuals = b.split(mean, 2, actions - 2)
-        context = b.add("Reshape", b.dense("to_legs", y), shape=[policy.feet, policy.leg_context])
-        leg = b.dense("leg_action", b.elu("leg", b.add("Concat", foot, context, axis=-1)))
-        leg = b.add("Reshape", b.add("Mul", leg, "leg_sign"), shape=[actions - 2])
-        mean = b.add("Concat", shared, b.add("Add", residuals, leg), axis=-1)
+        added.append(_legs(b, policy, "", [foot], y))
     if f"{_PARAMS}footholds.leg.kernel" in arrays:
-        shared, residuals = b.split(mean, 2, actions - 2)
-        mean = b.add("Concat", shared, b.add("Add", residuals, _footholds(b, policy, proprio, raw)), axis=-1)
+        added.append(_footholds(b, policy, proprio, heights_by_foot))
+    if added:
+        shared, residuals = b.split(mean, RESIDUALS.start, actions - RESIDUALS.start)
+        for leg in added:
+            residuals = b.add("Add", residuals, leg)
+        mean = b.add("Concat", shared, residuals, axis=-1)
     b.add("Tanh", mean, outputs=("action",))
     return b.nodes
 
@@ -282,10 +283,15 @@ def _footholds(b: _Builder, policy: Any, proprio: str, foot: str) -> str:
     flat = b.add("Reshape", foot, shape=[policy.feet * width])
     across = b.add("Gather", flat, axis=-1, indices=order.tolist())
     across = b.add("Reshape", across, shape=[policy.feet, width])
-    context = b.dense("footholds.to_legs", b.elu("footholds.proprio", proprio))
+    return _legs(b, policy, "footholds.", [foot, across], b.elu("footholds.proprio", proprio))
+
+
+def _legs(b: _Builder, policy: Any, prefix: str, foot: list[str], context: str) -> str:
+    """Residuals (12,) of the layers of `prefix` from what each foot sees, (4, ..) each, and a context of all legs."""
+    context = b.dense(f"{prefix}to_legs", context)
     context = b.add("Reshape", context, shape=[policy.feet, policy.leg_context])
-    leg = b.elu("footholds.leg", b.add("Concat", foot, across, context, axis=-1))
-    leg = b.add("Mul", b.dense("footholds.leg_action", leg), "leg_sign")
+    leg = b.elu(f"{prefix}leg", b.add("Concat", *foot, context, axis=-1))
+    leg = b.add("Mul", b.dense(f"{prefix}leg_action", leg), "leg_sign")
     return b.add("Reshape", leg, shape=[3 * policy.feet])
 
 

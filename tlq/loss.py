@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 import jax
 import jax.numpy as jnp
 from brax.training.agents.ppo.losses import PPONetworkParams, compute_gae
-from brax.training.agents.ppo.networks import PPONetworks
 
-from envs import guide
+from envs import Guidance, guide
+from tlq.networks import RESIDUALS, Networks
 
 if TYPE_CHECKING:
     from tlq.ppo import PPOConfig, Rollout
@@ -27,7 +27,7 @@ def ppo_loss(
     last: jax.Array,
     keys: jax.Array,
     *,
-    networks: PPONetworks,
+    networks: Networks,
     config: PPOConfig,
     axis: str,
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
@@ -49,7 +49,7 @@ def ppo_loss(
     """
     distribution = networks.parametric_action_distribution
     parameters = networks.policy_network.apply(
-        normaliser, params.policy, dict(rollout.observation, carry=carry[None])
+        normaliser, without_gradient(params.policy), dict(rollout.observation, carry=carry[None])
     )
     values = networks.value_network.apply(normaliser, params.value, rollout.observation)
     last_value = networks.value_network.apply(normaliser, params.value, {"privileged_state": last})
@@ -90,3 +90,31 @@ def ppo_loss(
         "std": jnp.mean(new.scale),
         "std_max": jnp.max(new.scale),
     }
+
+
+def without_gradient(policy: Any) -> Any:
+    """A policy's parameters of which those of the footholds get no gradient: to PPO they are part of the world."""
+    parts = policy["params"]
+    if "footholds" not in parts:
+        return policy
+    return {"params": dict(parts, footholds=jax.lax.stop_gradient(parts["footholds"]))}
+
+
+def foothold_loss(
+    params: Any, normaliser: Any, seen: jax.Array, rest: jax.Array, guidance: Guidance, *, networks: Networks
+) -> jax.Array:
+    """What a guide says () of the footholds.
+
+    Args:
+      params: of `networks.footholds` alone.
+      normaliser: of the observation.
+      seen: 'state' (.., S).
+      rest: (.., 12) the residuals' means without what the footholds add to them.
+      guidance: (.., ...).
+      networks: whose footholds are judged.
+    """
+    assert networks.footholds is not None
+    added = networks.footholds(normaliser, params, seen)
+    before = [(0, 0)] * (added.ndim - 1)
+    action = jnp.pad(jnp.tanh(rest + added), [*before, (RESIDUALS.start, 0)])  # only its residuals are judged
+    return jnp.mean(guide.cost(guidance, action) + guide.idle(guidance, added))

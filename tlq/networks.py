@@ -33,6 +33,8 @@ SAME_SIDE = np.array(
     ]
 )
 """Order of the 100 heights in which the right legs' (RF, RR) are those of left legs in the mirror."""
+RESIDUALS = slice(2, tg.ACTION_SIZE)
+"""Of an action [δf, δh, 12 residuals]."""
 LEG_SIGN = np.array([[1, 1, 1], [-1, 1, 1]] * 2, np.float32)
 """(4, 3) turns a left leg's residuals (abduction, hip, knee) into the same leg's."""
 
@@ -117,9 +119,27 @@ def _head_bias(initial_std: float) -> Callable[..., jax.Array]:
     return init
 
 
-def _by_foot(heights: jax.Array, feet: int) -> jax.Array:
-    """Heights (.., 100) foot by foot (.., 4, 25), the right ones in the mirror."""
-    return heights[..., SAME_SIDE].reshape(*heights.shape[:-1], feet, heights.shape[-1] // feet)
+SMALL = nn.initializers.variance_scaling(0.01**2, "fan_in", "truncated_normal")
+"""Of layers that give actions."""
+
+
+def _feet(c: NetworkConfig, heights: jax.Array) -> jax.Array:
+    """Layers of the module that calls it: heights (.., 100) to what each foot sees (.., 4, F), weights shared."""
+    foot = heights[..., SAME_SIDE].reshape(*heights.shape[:-1], c.feet, heights.shape[-1] // c.feet)
+    for i, width in enumerate(c.foot_encoder):
+        foot = nn.elu(Dense(width, name=f"foot_{i}")(foot))
+    return foot
+
+
+def _legs(c: NetworkConfig, width: int, foot: jax.Array, context: jax.Array) -> jax.Array:
+    """Layers of the module that calls it: what each foot sees (.., 4, F) and a context (.., X) of all legs to the
+    residuals (.., 12), weights shared by the legs.
+    """
+    context = Dense(c.feet * c.leg_context, name="to_legs")(context)
+    context = context.reshape(*foot.shape[:-1], c.leg_context)
+    leg = nn.elu(Dense(width, name="leg")(jnp.concatenate([foot, context], axis=-1)))
+    leg = Dense(3, kernel_init=SMALL, name="leg_action")(leg) * LEG_SIGN
+    return leg.reshape(*leg.shape[:-2], 3 * c.feet)
 
 
 class Footholds(nn.Module):
@@ -134,18 +154,11 @@ class Footholds(nn.Module):
     def __call__(self, proprio: jax.Array, heights: jax.Array) -> jax.Array:
         """proprio (.., S - 100), heights (.., 100) -> (.., 12)."""
         c = self.config
-        foot = _by_foot(heights, c.feet)
-        for i, width in enumerate(c.foot_encoder):
-            foot = nn.elu(Dense(width, name=f"foot_{i}")(foot))
+        foot = _feet(c, heights)
         # A trot swings a leg together with the one across.
-        across = foot[..., ::-1, :]
+        pair = jnp.concatenate([foot, foot[..., ::-1, :]], axis=-1)
         context = nn.elu(Dense(c.foothold_head, name="proprio")(proprio))
-        context = Dense(c.feet * c.leg_context, name="to_legs")(context)
-        context = context.reshape(*foot.shape[:-1], c.leg_context)
-        leg = nn.elu(Dense(c.foothold_head, name="leg")(jnp.concatenate([foot, across, context], axis=-1)))
-        small = nn.initializers.variance_scaling(0.01**2, "fan_in", "truncated_normal")
-        leg = Dense(3, kernel_init=small, name="leg_action")(leg) * LEG_SIGN
-        return leg.reshape(*leg.shape[:-2], 3 * c.feet)
+        return _legs(c, c.foothold_head, pair, context)
 
 
 class Policy(nn.Module):
@@ -167,9 +180,7 @@ class Policy(nn.Module):
         x = nn.elu(Dense(c.encoder, name="proprio")(proprio))
         foot = None
         if heights is not None:
-            foot = _by_foot(heights, c.feet)
-            for i, width in enumerate(c.foot_encoder):
-                foot = nn.elu(Dense(width, name=f"foot_{i}")(foot))
+            foot = _feet(c, heights)
             # The feet are told apart here: each has its own place in the input of `mix`.
             x = jnp.concatenate([x, foot.reshape(*x.shape[:-1], -1)], axis=-1)
         x = nn.elu(Dense(c.encoder, name="mix")(x))
@@ -177,24 +188,18 @@ class Policy(nn.Module):
         carry, y = Memory(c.memory, c.memory_layers, c.memory_width, name="memory")(carry, y, is_first)
         # x skips the memory, so that reflexes don't have to pass through it.
         y = nn.elu(Dense(c.head, name="head")(jnp.concatenate([x, y], axis=-1)))
-        small = nn.initializers.variance_scaling(0.01**2, "fan_in", "truncated_normal")
         out = Dense(
-            2 * self.action_size, kernel_init=small, bias_init=_head_bias(c.initial_std), name="action"
+            2 * self.action_size, kernel_init=SMALL, bias_init=_head_bias(c.initial_std), name="action"
         )
         action = out(y)
+        residuals = []
         if foot is not None and c.leg_head:
-            context = Dense(c.feet * c.leg_context, name="to_legs")(y)
-            context = context.reshape(*foot.shape[:-1], c.leg_context)
-            leg = nn.elu(Dense(c.leg_head, name="leg")(jnp.concatenate([foot, context], axis=-1)))
-            leg = Dense(3, kernel_init=small, name="leg_action")(leg) * LEG_SIGN
-            # Means are [δf, δh, 12 residuals, ...].
-            rest = [(0, 0)] * (action.ndim - 1)
-            leg = leg.reshape(*leg.shape[:-2], 3 * c.feet)
-            action = action + jnp.pad(leg, [*rest, (2, 2 * self.action_size - 2 - 3 * c.feet)])
+            residuals.append(_legs(c, c.leg_head, foot, y))
         if heights is not None and c.foothold_head:
-            residuals = Footholds(c, name="footholds")(proprio, heights)
-            rest = [(0, 0)] * (action.ndim - 1)
-            action = action + jnp.pad(residuals, [*rest, (2, 2 * self.action_size - 2 - 3 * c.feet)])
+            residuals.append(Footholds(c, name="footholds")(proprio, heights))
+        if residuals:
+            around = (RESIDUALS.start, 2 * self.action_size - RESIDUALS.stop)
+            action = action + jnp.pad(sum(residuals), [*[(0, 0)] * (action.ndim - 1), around])
         return {"action": action, "carry": carry}
 
 

@@ -22,16 +22,14 @@ from brax.training.agents.ppo.losses import PPONetworkParams
 from jax.sharding import Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
 
-from envs import Guidance, guide
-from tlq.loss import ppo_loss
-from tlq.networks import Networks
+from envs import Guidance
+from tlq.loss import foothold_loss, ppo_loss
+from tlq.networks import RESIDUALS, Networks
 
 AXIS = "data"
 NORMALISED = ("state", "privileged_state")
 STREAMS = 16
 """Groups of environments that are shuffled each by itself: a minibatch doesn't depend on the number of devices."""
-
-
 STRIDE = 5
 """A minibatch of the guide has every fifth step of its environments: their neighbours say nearly the same."""
 
@@ -69,12 +67,13 @@ class PPOConfig:
     reward_scaling: float = 0.1
     """Factor on the reward."""
     guide: float = 4.0
-    """Weight of what footholds cost by the scripted guide (envs/guide.py) where the terrain has pits; 0: the policy
-    learns them by reward alone."""
+    """0: the policy learns footholds by reward alone, without the scripted guide (envs/guide.py) that says what they
+    cost where the terrain has pits. Otherwise the weight of that cost in PPO's loss, if the policy has no part of its
+    own for them (`policy.foothold_head`), which the guide teaches apart."""
     guide_rate: float = 1e-3
-    """Adam's learning rate of the part of the policy that leads feet to footholds, while the guide teaches it."""
+    """Adam's learning rate of the part of the policy that leads feet to footholds."""
     guide_epochs: int = 2
-    """Passes over the data of an iteration in which the guide teaches it."""
+    """Passes over the data of an iteration in which the guide teaches that part."""
 
 
 @flax.struct.dataclass
@@ -82,7 +81,8 @@ class TrainState:
     """All that an iteration reads and changes."""
 
     params: PPONetworkParams
-    opt_state: Any
+    opt_state: Any  # of PPO
+    guide_opt_state: Any  # of the footholds that the guide teaches; () without
     learning_rate: jax.Array  # ()
     normaliser: running_statistics.RunningStatisticsState  # of 'state' (S,) and 'privileged_state' (V,)
     env_state: State  # every leaf (B, ...)
@@ -156,7 +156,8 @@ class Learner:
             optax.clip_by_global_norm(config.max_grad_norm), optax.scale_by_adam(eps=1e-5)
         )
         self._loss = functools.partial(ppo_loss, networks=networks, config=config, axis=AXIS)
-        specs: list[Any] = [P(), P(), P(), P(), P(AXIS), P(), P()]  # only the environments are split
+        self._foothold_loss = functools.partial(foothold_loss, networks=networks)
+        specs: list[Any] = [P(), P(), P(), P(), P(), P(AXIS), P(), P()]  # only the environments are split
         self.specs = TrainState(*specs)
         self._hoist()
         # Nothing is donated: the state before an update stays whole, so that a failed one can be saved and replayed.
@@ -214,6 +215,10 @@ class Learner:
         """Splits the environment into functions and the arrays they close over, which are put on every device."""
         keys = jax.eval_shape(lambda: jax.random.split(jax.random.PRNGKey(0), self.num_envs))
         env_state = jax.eval_shape(self.env.reset, keys)
+        if self.networks.footholds is not None and "guide" not in env_state.info:
+            raise ValueError(
+                "nobody teaches the footholds: set foothold_head=0 or wrap the environment in Guided"
+            )
         here = self.num_envs // self.devices
         env_state = jax.tree.map(lambda x: jax.ShapeDtypeStruct((here, *x.shape[1:]), x.dtype), env_state)
         action = {
@@ -239,7 +244,10 @@ class Learner:
         seen = {name: jnp.zeros(env_state.obs[name].shape[1:]) for name in NORMALISED}
         state = TrainState(
             params=params,
-            opt_state=(self._optimiser.init(params), self._optimiser.init(self._footholds(params))),
+            opt_state=self._optimiser.init(params),
+            guide_opt_state=()
+            if self.networks.footholds is None
+            else self._optimiser.init(params.policy["params"]["footholds"]),
             learning_rate=jnp.float32(self.config.learning_rate),
             normaliser=running_statistics.init_state(seen, std_eps=1e-4),
             env_state=env_state,
@@ -249,10 +257,6 @@ class Learner:
         # Strong types throughout: with a weak one in the environment's state the second call would compile again.
         return jax.tree.map(lambda x: jax.lax.convert_element_type(x, jnp.asarray(x).dtype), state)
 
-    def _footholds(self, params: PPONetworkParams) -> Any:
-        """The parameters that the guide teaches; none if there is no such part."""
-        return params.policy["params"].get("footholds", {})
-
     # -- one iteration, on each device ---------------------------------------------------------------------------------
 
     def _iteration(
@@ -261,9 +265,7 @@ class Learner:
         key, key_rollout, key_update = jax.random.split(state.key, 3)
         carry = state.env_state.obs["carry"]
         env_state, rollout, env_metrics = self._rollout(constants, state, key_rollout)
-        params, opt_state, losses = self._update(
-            state, carry, rollout, env_state.obs["privileged_state"], key_update
-        )
+        *learnt, losses = self._update(state, carry, rollout, env_state.obs["privileged_state"], key_update)
         # Statistics move after the gradient steps, so that the first ratio of new to old probability is 1.
         # A quarter of the steps says the same at a quarter of the cost.
         normaliser = running_statistics.update(
@@ -271,15 +273,16 @@ class Learner:
         )
         # The very first iteration only looks: a policy isn't trained on observations that aren't normalised yet.
         looking = (state.normaliser.count.hi == 0) & (state.normaliser.count.lo == 0)
-        params, opt_state = jax.tree.map(
+        params, opt_state, guide_opt_state = jax.tree.map(
             lambda old, new: jnp.where(looking, old, new),
-            (state.params, state.opt_state),
-            (params, opt_state),
+            [state.params, state.opt_state, state.guide_opt_state],
+            learnt,
         )
         kl = jnp.where(looking, self.config.kl_target, losses["kl_last"])
         new_state = TrainState(
             params=params,
             opt_state=opt_state,
+            guide_opt_state=guide_opt_state,
             learning_rate=adapt_learning_rate(state.learning_rate, kl, self.config),
             normaliser=normaliser,
             env_state=env_state,
@@ -324,109 +327,86 @@ class Learner:
         here = self.num_envs // self.devices
         return jax.lax.axis_index(AXIS) * here + jnp.arange(here)
 
-    def _minibatches(self, key: jax.Array, config: PPOConfig | None = None) -> jax.Array:
-        """This device's environments (epochs x M, B / M), shuffled stream by stream anew in each pass."""
-        c, here = config or self.config, self.streams // self.devices
+    def _minibatches(self, key: jax.Array, passes: int) -> jax.Array:
+        """This device's environments (passes x M, B / M), shuffled stream by stream anew in each pass."""
+        minibatches, here = self.config.minibatches, self.streams // self.devices
         size = self.num_envs // self.streams
 
         def order(stream: jax.Array) -> jax.Array:
-            keys = jax.random.split(
-                jax.random.fold_in(key, jax.lax.axis_index(AXIS) * here + stream), c.epochs
-            )
+            keys = jax.random.split(jax.random.fold_in(key, jax.lax.axis_index(AXIS) * here + stream), passes)
             return stream * size + jax.vmap(lambda k: jax.random.permutation(k, size))(keys)
 
-        orders = jax.vmap(order)(jnp.arange(here)).reshape(here, c.epochs, c.minibatches, -1)
-        return jnp.moveaxis(orders, 0, 2).reshape(c.epochs * c.minibatches, -1)
+        orders = jax.vmap(order)(jnp.arange(here)).reshape(here, passes, minibatches, -1)
+        return jnp.moveaxis(orders, 0, 2).reshape(passes * minibatches, -1)
+
+    def _descend(self, params: Any, opt_state: Any, grads: Any, rate: jax.Array | float) -> tuple[Any, Any]:
+        """Parameters and optimiser's state after a gradient step."""
+        updates, opt_state = self._optimiser.update(grads, opt_state)
+        return optax.apply_updates(params, jax.tree.map(lambda u: -rate * u, updates)), opt_state
 
     def _update(
         self, state: TrainState, carry: jax.Array, rollout: Rollout, last: jax.Array, key: jax.Array
-    ) -> tuple[PPONetworkParams, Any, dict[str, jax.Array]]:
-        """`epochs` passes of gradient steps.
+    ) -> tuple[PPONetworkParams, Any, Any, dict[str, jax.Array]]:
+        """`epochs` passes of gradient steps; then, if there are footholds to teach, the guide's.
 
-        carry: (B, C) from before the first step; last: (B, V) 'privileged_state' after the last.
+        carry: (B, C) from before the first step; last: (B, V) 'privileged_state' after the last. Returns parameters,
+        both optimisers' states, and figures.
         """
         c = self.config
         key_order, key_loss = jax.random.split(key)
-        chosen, numbers = self._minibatches(key_order), self._numbers()
-        taught = rollout.guide is not None and self.networks.footholds is not None
+        chosen, numbers = self._minibatches(key_order, c.epochs), self._numbers()
 
         def gradient_step(carried, inputs):
             params, opt_state = carried
             index, key = inputs
             batch = jax.tree.map(lambda x: x[:, index], rollout)
-            (_, losses), grads = jax.value_and_grad(
-                lambda p, *rest: self._loss(_frozen(p) if taught else p, *rest), has_aux=True
-            )(params, state.normaliser, batch, carry[index], last[index], _keys(key, numbers[index]))
+            (_, losses), grads = jax.value_and_grad(self._loss, has_aux=True)(
+                params, state.normaliser, batch, carry[index], last[index], _keys(key, numbers[index])
+            )
             grads, losses = jax.lax.pmean((grads, losses), AXIS)
-            updates, opt_state = self._optimiser.update(grads, opt_state)
-            params = optax.apply_updates(params, jax.tree.map(lambda u: -state.learning_rate * u, updates))
-            return (params, opt_state), dict(losses, grad_norm=optax.global_norm(grads))
+            carried = self._descend(params, opt_state, grads, state.learning_rate)
+            return carried, dict(losses, grad_norm=optax.global_norm(grads))
 
         (params, opt_state), losses = jax.lax.scan(
             gradient_step,
-            (state.params, state.opt_state[0]),
+            (state.params, state.opt_state),
             (chosen, jax.random.split(key_loss, c.epochs * c.minibatches)),
         )
-        figures, teach_state = _loss_metrics(losses, c.minibatches), state.opt_state[1]
-        if taught:
-            key_teach = jax.random.fold_in(key, 2)
-            params, teach_state, cost = self._teach(state, params, rollout, key_teach)
+        figures, guide_opt_state = _loss_metrics(losses, c.minibatches), state.guide_opt_state
+        if self.networks.footholds is not None:
+            # 2: the two keys above are those folded with 0 and 1.
+            footholds, guide_opt_state, cost = self._teach(state, rollout, jax.random.fold_in(key, 2))
+            params = params.replace(policy={"params": dict(params.policy["params"], footholds=footholds)})
             figures["loss/guide"] = cost
-        return params, (opt_state, teach_state), figures
+        return params, opt_state, guide_opt_state, figures
 
-    def _teach(
-        self, state: TrainState, params: PPONetworkParams, rollout: Rollout, key: jax.Array
-    ) -> tuple[PPONetworkParams, Any, jax.Array]:
-        """Gradient steps by which the policy's footholds cost less; the rest of it stays as it is.
+    def _teach(self, state: TrainState, rollout: Rollout, key: jax.Array) -> tuple[Any, Any, jax.Array]:
+        """`guide_epochs` passes by which the footholds cost less, with the rest of the policy as it acted.
 
-        Returns parameters, the optimiser's state, and the mean cost () in the last pass.
+        Returns their parameters, their optimiser's state, and the mean cost () in the last pass.
         """
-        c, footholds = self.config, self.networks.footholds
-        assert footholds is not None and rollout.guide is not None
-        policy = params.policy["params"]
-        old = jax.lax.map(
-            lambda x: footholds(state.normaliser, self._footholds(state.params), x),
-            rollout.observation["state"],
-        )
-        rest = rollout.parameters[..., : self.env.action_size] - jnp.pad(old, ((0, 0), (0, 0), (2, 0)))
-        data = {"state": rollout.observation["state"], "rest": rest, "guide": rollout.guide}
+        c, footholds = self.config, state.params.policy["params"]["footholds"]
+        assert self.networks.footholds is not None
+        seen, acted = rollout.observation["state"], rollout.parameters[..., RESIDUALS]
+        rest = acted - self.networks.footholds(state.normaliser, footholds, seen)
+        data = seen, rest, rollout.guide
         stride = math.gcd(STRIDE, c.unroll)
-        every = dataclasses.replace(c, epochs=c.guide_epochs)
-        chosen = self._minibatches(key, every)
-        chosen = jnp.repeat(chosen, stride, axis=0)
-        offsets = jnp.tile(jnp.arange(stride), chosen.shape[0] // stride)
-        times = jnp.arange(c.unroll // stride) * stride
-
-        def loss(own: Any, batch: dict[str, Any]) -> jax.Array:
-            residuals = footholds(state.normaliser, own, batch["state"])
-            mean = batch["rest"] + jnp.pad(residuals, ((0, 0), (0, 0), (2, 0)))
-            return jnp.mean(
-                guide.cost(batch["guide"], jnp.tanh(mean)) + guide.idle(batch["guide"], residuals)
-            )
+        chosen = jnp.repeat(self._minibatches(key, c.guide_epochs), stride, axis=0)
+        first = jnp.arange(len(chosen)) % stride
 
         def gradient_step(carried, inputs):
-            own, opt_state = carried
-            index, offset = inputs
-            batch = jax.tree.map(lambda x: x[(times + offset)[:, None], index], data)
-            cost, grads = jax.value_and_grad(loss)(own, batch)
+            footholds, opt_state = carried
+            index, first = inputs
+            times = first + jnp.arange(0, c.unroll, stride)
+            batch = jax.tree.map(lambda x: x[times[:, None], index], data)
+            cost, grads = jax.value_and_grad(self._foothold_loss)(footholds, state.normaliser, *batch)
             cost, grads = jax.lax.pmean((cost, grads), AXIS)
-            updates, opt_state = self._optimiser.update(grads, opt_state)
-            own = optax.apply_updates(own, jax.tree.map(lambda u: -c.guide_rate * u, updates))
-            return (own, opt_state), cost
+            return self._descend(footholds, opt_state, grads, c.guide_rate), cost
 
-        (own, opt_state), costs = jax.lax.scan(
-            gradient_step, (self._footholds(state.params), state.opt_state[1]), (chosen, offsets)
+        (footholds, opt_state), costs = jax.lax.scan(
+            gradient_step, (footholds, state.guide_opt_state), (chosen, first)
         )
-        params = params.replace(policy={"params": dict(policy, footholds=own)})
-        return params, opt_state, jnp.mean(costs[-stride * c.minibatches :])
-
-
-def _frozen(params: PPONetworkParams) -> PPONetworkParams:
-    """Parameters of which those of the footholds get no gradient: to PPO they are part of the world."""
-    policy = params.policy["params"]
-    return params.replace(
-        policy={"params": dict(policy, footholds=jax.lax.stop_gradient(policy["footholds"]))}
-    )
+        return footholds, opt_state, jnp.mean(costs[-stride * c.minibatches :])
 
 
 def _keys(key: jax.Array, numbers: jax.Array) -> jax.Array:

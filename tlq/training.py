@@ -25,7 +25,7 @@ from tlq.config import TrainConfig, load_config, save_config, training_env
 from tlq.export import commit
 from tlq.files import whole
 from tlq.logger import Logger
-from tlq.networks import make_networks
+from tlq.networks import RESIDUALS, make_networks
 from tlq.ppo import Learner, TrainState, make_mesh
 
 
@@ -247,14 +247,20 @@ def initialise(state: TrainState, source: str, config: TrainConfig | None = None
     return dataclasses.replace(state, params=parts["params"], normaliser=parts["normaliser"])
 
 
+def _spread_times(factor: float, raw: np.ndarray) -> np.ndarray:
+    """Raw scales whose softplus is `factor` times that of `raw`; finite however large."""
+    spread = factor * np.logaddexp(raw, 0.0)
+    return spread + np.log(-np.expm1(-spread))
+
+
 def rescale_residuals(arrays: dict[str, np.ndarray], ratio: float) -> dict[str, np.ndarray]:
     """A policy's parameters and normaliser with residual actions `ratio` times as large as they were.
 
     So it asks for the same angles where the range of residuals is 1/ratio times as wide: exactly where actions are
     small, somewhat more where they were near their limits.
     """
-    arrays, residual = dict(arrays), slice(2, tg.ACTION_SIZE)
-    spread = slice(tg.ACTION_SIZE + 2, 2 * tg.ACTION_SIZE)
+    arrays, residual = dict(arrays), RESIDUALS
+    spread = slice(tg.ACTION_SIZE + RESIDUALS.start, 2 * tg.ACTION_SIZE)
     start = 0
     for name, size in tg.core.layout(heights=False):
         if name == "actions":
@@ -267,7 +273,7 @@ def rescale_residuals(arrays: dict[str, np.ndarray], ratio: float) -> dict[str, 
             x[:, residual] *= ratio
         elif name.endswith("params.action.bias"):
             x[residual] *= ratio
-            x[spread] = np.log(np.expm1(ratio * np.logaddexp(x[spread], 0.0)))
+            x[spread] = _spread_times(ratio, x[spread])
         elif ".leg_action." in name:
             x *= ratio
         elif name.startswith(("normaliser.mean.", "normaliser.std.")):
@@ -288,7 +294,7 @@ def rescale_spread(arrays: dict[str, np.ndarray], factor: float) -> dict[str, np
     arrays, name = dict(arrays), "params.policy.params.action.bias"
     if name in arrays:
         x = np.array(arrays[name])
-        x[tg.ACTION_SIZE :] = np.log(np.expm1(factor * np.logaddexp(x[tg.ACTION_SIZE :], 0.0)))
+        x[tg.ACTION_SIZE :] = _spread_times(factor, x[tg.ACTION_SIZE :])
         arrays[name] = x
     return arrays
 

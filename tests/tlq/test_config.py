@@ -97,6 +97,15 @@ def test_a_saved_configuration_reads_back(tmp_path):
         settings.build(type(config.ppo), {"clipp": 0.1})
 
 
+def test_settings_that_an_older_run_does_not_name_are_as_they_were(tmp_path):
+    path = tmp_path / "config.yaml"
+    settings.save_config(parse("terrain=poles", "run=r"), path)
+    assert settings.load_config(path).policy.foothold_head > 0
+    lines = path.read_text().splitlines(keepends=True)
+    path.write_text("".join(line for line in lines if "foothold_head" not in line))
+    assert settings.load_config(path).policy.foothold_head == 0
+
+
 def test_resume_keeps_the_runs_settings_but_for_those_given(tmp_path):
     run = f"run={tmp_path}"
     settings.save_config(parse("terrain=poles", "ppo.clip=0.1", "steps=100", run), tmp_path / "config.yaml")

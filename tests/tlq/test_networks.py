@@ -160,6 +160,23 @@ def test_proprioception_is_normalised_and_heights_are_not():
     np.testing.assert_array_equal(near, beyond)
 
 
+def test_footholds_are_a_part_of_the_policy_that_adds_to_the_residuals():
+    obs = observation()
+    networks = make_networks({"state": 110, "privileged_state": 20}, 14, config=SMALL)
+    stats = statistics(obs, 0.3, 2.0)
+    params = networks.policy_network.init(jax.random.PRNGKey(0))
+    params = jax.tree.map(lambda x: x + 0.1 * random(*x.shape), params)
+    own = params["params"]["footholds"]
+    without = {"params": dict(params["params"], footholds=jax.tree.map(jnp.zeros_like, own))}
+    both = networks.policy_network.apply(stats, params, obs)["action"]
+    rest = networks.policy_network.apply(stats, without, obs)["action"]
+    added = networks.footholds(stats, own, obs["state"])
+    assert float(jnp.abs(added).max()) > 0.01
+    expected = np.array(rest)
+    expected[..., 2:14] += added  # after frequency and lift; then the raw scales
+    np.testing.assert_allclose(both, expected, atol=1e-6)
+
+
 def test_only_the_action_enters_the_density():
     networks = make_networks({"state": 110, "privileged_state": 20}, ACTIONS, config=SMALL)
     mine, plain = networks.parametric_action_distribution, NormalTanhDistribution(ACTIONS)

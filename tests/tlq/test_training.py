@@ -14,6 +14,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from brax.training.acme.running_statistics import init_state
+from brax.training.agents.ppo.losses import PPONetworkParams
 
 from tests.tlq.toy import ToyEnv
 from tlq import training
@@ -21,7 +23,7 @@ from tlq.checkpoint import names, read_arrays
 from tlq.config import TrainConfig, load_config
 from tlq.logger import Logger, read_csv, text_line
 from tlq.networks import NetworkConfig, make_networks
-from tlq.ppo import PPOConfig
+from tlq.ppo import PPOConfig, TrainState
 from tlq.training import (
     TrainingFailed,
     initialise,
@@ -212,35 +214,45 @@ def test_a_run_can_start_from_a_policy_file(run, learner, tmp_path):
     np.testing.assert_allclose(after.normaliser.mean["privileged_state"][0], 0.0, atol=1.0)
 
 
-def test_a_policy_is_started_with_less_exploration():
-    networks = make_networks({"state": (188,), "privileged_state": (232,)}, 14, config=NetworkConfig())
-    policy = networks.policy_network.init(jax.random.PRNGKey(0))
-    random = np.random.default_rng(0)
-    policy["params"]["action"]["kernel"] = jnp.asarray(random.normal(size=(64, 28)) * 0.05)
-    before = {
-        "params.policy.params.action.bias": policy["params"]["action"]["bias"],
-        "another": np.ones(3),
-    }
-    after = rescale_spread(before, 0.5)
-    np.testing.assert_array_equal(after.pop("another"), np.ones(3))
-    narrow = jax.tree.map(jnp.array, policy)
-    (narrow["params"]["action"]["bias"],) = map(jnp.asarray, after.values())
-    observation = {
-        "state": jnp.asarray(random.normal(size=(50, 188)), jnp.float32),
-        "carry": jnp.zeros((50, 128)),
-        "is_first": jnp.ones((50, 1)),
-    }
-    identity = make_networks(
-        {"state": (188,), "privileged_state": (232,)}, 14, lambda x, _: x, config=NetworkConfig()
+@pytest.mark.parametrize("factor", [0.5, 100.0])
+def test_a_policy_is_started_with_less_exploration(factor):
+    raw, bias = np.linspace(-3, 3, 14, dtype=np.float32), "params.policy.params.action.bias"
+    before = {bias: np.concatenate([np.ones(14, np.float32), raw]), "another": np.ones(3)}
+    after = rescale_spread(before, factor)
+    np.testing.assert_array_equal(after["another"], np.ones(3))
+    np.testing.assert_array_equal(after[bias][:14], np.ones(14))
+    np.testing.assert_allclose(
+        jax.nn.softplus(after[bias][14:]), factor * jax.nn.softplus(raw), rtol=1e-5, atol=1e-6
     )
-    mean, std = {}, {}
-    for name, parameters in (("before", policy), ("after", narrow)):
-        found = identity.policy_network.apply(None, parameters, observation)
-        distribution = identity.parametric_action_distribution.create_dist(found)
-        mean[name], std[name] = np.asarray(distribution.loc), np.asarray(distribution.scale)
-    np.testing.assert_array_equal(mean["after"], mean["before"])
-    np.testing.assert_allclose(std["after"], 0.5 * std["before"], rtol=0.1)
-    assert std["before"].std(axis=0).max() > 0.01  # it differs from state to state
+
+
+def started(head, file):
+    """Parameters of a policy for footholds or not, from a file."""
+    config = dataclasses.replace(NETWORKS, foothold_head=head)
+    networks = make_networks(ToyEnv().observation_size, 14, config=config)
+    params = PPONetworkParams(networks.policy_network.init(jax.random.PRNGKey(1)), {})
+    normaliser = init_state({name: jnp.zeros(n) for name, n in ToyEnv().observation_size.items()})
+    state = TrainState(params, (), (), 0.0, normaliser, None, None, 0)
+    return params.policy["params"], initialise(state, str(file)).params.policy["params"]
+
+
+def test_footholds_are_new_to_a_policy_from_before(learner, tmp_path):
+    """They begin as untrained ones do; the rest is the old policy's."""
+    state = learner.init(0)
+    arrays = dict(zip(names(state), map(np.asarray, jax.tree.leaves(state)), strict=True))
+    np.savez(tmp_path / "policy.npz", **{n: x for n, x in arrays.items() if n.startswith("params.policy")})
+    fresh, taken = started(8, tmp_path / "policy.npz")
+    jax.tree.map(np.testing.assert_array_equal, taken["footholds"], fresh["footholds"])
+    jax.tree.map(np.testing.assert_array_equal, taken["mix"], state.params.policy["params"]["mix"])
+    assert (taken["mix"]["kernel"] != fresh["mix"]["kernel"]).any()
+
+
+def test_footholds_are_not_left_out_silently(learner, tmp_path):
+    state = learner.init(0)
+    arrays = dict(zip(names(state), map(np.asarray, jax.tree.leaves(state)), strict=True))
+    np.savez(tmp_path / "policy.npz", **arrays, **{"params.policy.params.footholds.leg.bias": np.zeros(8)})
+    with pytest.raises(ValueError, match="it has a part for footholds, which needs terrain with pits"):
+        initialise(state, str(tmp_path / "policy.npz"))
 
 
 def test_parameters_of_other_sizes_are_refused(learner, tmp_path):
