@@ -45,6 +45,9 @@ squared. A foot that is let go pushes the trunk by as much as it was led aside."
 ALWAYS, IDLE = 0.05, 1.0
 """What it costs to move a leg's joints by the whole range of residual angles, with the square; and beyond, where the
 guide asks for nothing."""
+STEADY = 0.06
+"""Changing the place that a foot in swing is led to by that many metres from one step to the next costs 1, and with the
+square of it: a foot follows its joints' targets late, so where those still move about it comes down beside them."""
 LED = 0.02
 """Displacement (m) from which on a foot is held altogether."""
 SMOOTHING = 0.3
@@ -219,6 +222,10 @@ class Guidance(NamedTuple):
     """(4, 2) m, where feet in stance were led when they came down."""
     hold: jax.Array
     """(4,) how much that counts, 0 in swing."""
+    last: jax.Array
+    """(4, 2) m, where the last action would lead the feet."""
+    steady: jax.Array
+    """(4,) how much it counts to lead them there again, 0 where they had better be left alone."""
 
 
 def guide(env: QuadrupedEnv, episode: Episode, held: jax.Array) -> Guidance:
@@ -229,8 +236,9 @@ def guide(env: QuadrupedEnv, episode: Episode, held: jax.Array) -> Guidance:
     s, controller = steps(env, episode), episode.controller
     walking = jnp.sum(jnp.square(episode.command)) > 0.5
     stance = (tg.path.leg_phases(controller.phase) <= 0) & walking
+    lead, last = _lead(env, episode)
     own = Guidance(
-        lead=_lead(env, episode),
+        lead=lead,
         legs=s.legs.astype(jnp.int32),
         gaps=s.gaps.astype(jnp.float16),
         ahead=s.ahead,
@@ -238,13 +246,16 @@ def guide(env: QuadrupedEnv, episode: Episode, held: jax.Array) -> Guidance:
         weight=jnp.where(s.asked, s.share, 0.0),
         held=held,
         hold=jnp.where(stance, jnp.clip(jnp.linalg.norm(held, axis=-1) / LED, 0.0, 1.0), 0.0),
+        last=last,
+        steady=jnp.zeros(4).at[s.legs].set(jnp.where(s.asked, s.share, 0.0)),
     )
     mirror = env.core.update_mirror(controller.mirror, env.heading_command(episode))
     return jax.tree.map(lambda mine, other: jnp.where(mirror > 0, mine, other), own, _mirrored(own))
 
 
-def _lead(env: QuadrupedEnv, episode: Episode) -> jax.Array:
-    """`Guidance.lead` (4, 2, 4) of the robot's own sides, round the last action: the next doesn't differ by much."""
+def _lead(env: QuadrupedEnv, episode: Episode) -> tuple[jax.Array, jax.Array]:
+    """`Guidance.lead` (4, 2, 4) of the robot's own sides, round the last action: the next doesn't differ by much. And
+    `Guidance.last` (4, 2)."""
     core, (target, level) = env.core, _target(env, episode)
     standing = tg.leg.inverse(core.geometry, target)
 
@@ -256,7 +267,7 @@ def _lead(env: QuadrupedEnv, episode: Episode) -> jax.Array:
     moved, change = jax.linearize(feet, last)
     slope = jnp.stack([change(jnp.zeros((4, 3)).at[:, joint].set(1.0)) for joint in range(3)], axis=-1)
     rest = moved - jnp.einsum("lij,lj->li", slope, last)
-    return jnp.concatenate([slope, rest[..., None]], axis=-1)
+    return jnp.concatenate([slope, rest[..., None]], axis=-1), moved
 
 
 def _mirrored(guidance: Guidance) -> Guidance:
@@ -271,11 +282,13 @@ def _mirrored(guidance: Guidance) -> Guidance:
         weight=guidance.weight,
         held=guidance.held[swapped] * side,
         hold=guidance.hold[swapped],
+        last=guidance.last[swapped] * side,
+        steady=guidance.steady[swapped],
     )
 
 
 def cost(guidance: Guidance, action: jax.Array) -> jax.Array:
-    """What the footholds cost (...) to which actions (..., 14) lead: gaps, imbalance, and feet let go.
+    """What the footholds cost (...) to which actions (..., 14) lead: gaps, imbalance, feet let go or led elsewhere.
 
     To be lowered by its slope: of several places an action slides into the nearest. The mean of the best places, which
     imitation ends at where they are ambiguous, may be a gap.
@@ -283,6 +296,7 @@ def cost(guidance: Guidance, action: jax.Array) -> jax.Array:
     residual = action[..., 2:].reshape(*action.shape[:-1], 4, 1, 3)
     feet = jnp.sum(guidance.lead[..., :3] * residual, axis=-1) + guidance.lead[..., 3]
     let_go = jnp.sum(guidance.hold * jnp.sum(jnp.square((feet - guidance.held) / HELD), axis=-1), axis=-1)
+    changed = jnp.sum(guidance.steady * jnp.sum(jnp.square((feet - guidance.last) / STEADY), axis=-1), axis=-1)
     led = jnp.take_along_axis(feet, guidance.legs[..., None], axis=-2)
     beyond = jnp.sum(jnp.maximum(jnp.abs(led) - REACH * CELL, 0.0), axis=-1)
     off = led - guidance.ahead[..., None, :]
@@ -290,7 +304,7 @@ def cost(guidance: Guidance, action: jax.Array) -> jax.Array:
     each = GAP * between(guidance.gaps.astype(jnp.float32), led) + FARTHER * far + BEYOND * beyond
     middle = jnp.abs(jnp.sum(jnp.mean(off, axis=-2) * guidance.across, axis=-1))
     both = jnp.min(guidance.weight, axis=-1)
-    return jnp.sum(guidance.weight * each, axis=-1) + both * ACROSS * middle + HOLD * let_go
+    return jnp.sum(guidance.weight * each, axis=-1) + both * ACROSS * middle + HOLD * let_go + changed
 
 
 def idle(guidance: Guidance, residual: jax.Array) -> jax.Array:

@@ -260,22 +260,20 @@ def policy_graph(policy: Any, arrays: Mapping[str, np.ndarray], heights: int) ->
     y = b.elu("head", b.add("Concat", x, y, axis=-1))
     actions = arrays[f"{_PARAMS}action.bias"].size // 2
     mean, _ = b.split(b.dense("action", y), actions, actions)
-    added = []
-    if heights and policy.leg_head:
-        added.append(_legs(b, policy, "", [foot], y))
-    if f"{_PARAMS}footholds.leg.kernel" in arrays:
-        added.append(_footholds(b, policy, proprio, heights_by_foot))
-    if added:
+    led = any(name.startswith(f"{_PARAMS}footholds.") for name in arrays)
+    if heights and (policy.leg_head or led):
         shared, residuals = b.split(mean, RESIDUALS.start, actions - RESIDUALS.start)
-        for leg in added:
-            residuals = b.add("Add", residuals, leg)
+        if policy.leg_head:
+            residuals = b.add("Add", residuals, _legs(b, policy, "", [foot], y)[0])
+        if led:
+            residuals = _footholds(b, policy, proprio, heights_by_foot, residuals)
         mean = b.add("Concat", shared, residuals, axis=-1)
     b.add("Tanh", mean, outputs=("action",))
     return b.nodes
 
 
-def _footholds(b: _Builder, policy: Any, proprio: str, foot: str) -> str:
-    """`tlq.networks.Footholds`; foot: the heights (4, 25) of the feet."""
+def _footholds(b: _Builder, policy: Any, proprio: str, foot: str, rest: str) -> str:
+    """Residuals (12,) of `tlq.networks.Footholds` with the rest's; foot: the heights (4, 25) of the feet."""
     for i in range(len(policy.foot_encoder)):
         foot = b.elu(f"footholds.foot_{i}", foot)
     width = policy.foot_encoder[-1]
@@ -283,16 +281,20 @@ def _footholds(b: _Builder, policy: Any, proprio: str, foot: str) -> str:
     flat = b.add("Reshape", foot, shape=[policy.feet * width])
     across = b.add("Gather", flat, axis=-1, indices=order.tolist())
     across = b.add("Reshape", across, shape=[policy.feet, width])
-    return _legs(b, policy, "footholds.", [foot, across], b.elu("footholds.proprio", proprio))
+    own, leg = _legs(b, policy, "footholds.", [foot, across], b.elu("footholds.proprio", proprio))
+    share = b.add("Reshape", b.dense("footholds.share", leg), shape=[3 * policy.feet])
+    return b.mix(b.add("Sigmoid", share), rest, own)
 
 
-def _legs(b: _Builder, policy: Any, prefix: str, foot: list[str], context: str) -> str:
-    """Residuals (12,) of the layers of `prefix` from what each foot sees, (4, ..) each, and a context of all legs."""
+def _legs(b: _Builder, policy: Any, prefix: str, foot: list[str], context: str) -> tuple[str, str]:
+    """Residuals (12,) of the layers of `prefix` from what each foot sees, (4, ..) each, and a context of all legs; and
+    the layer (4, ..) before them.
+    """
     context = b.dense(f"{prefix}to_legs", context)
     context = b.add("Reshape", context, shape=[policy.feet, policy.leg_context])
     leg = b.elu(f"{prefix}leg", b.add("Concat", *foot, context, axis=-1))
-    leg = b.add("Mul", b.dense(f"{prefix}leg_action", leg), "leg_sign")
-    return b.add("Reshape", leg, shape=[3 * policy.feet])
+    residuals = b.add("Mul", b.dense(f"{prefix}leg_action", leg), "leg_sign")
+    return b.add("Reshape", residuals, shape=[3 * policy.feet]), leg
 
 
 def _add_memory(b: _Builder, policy: Any, y: str) -> str:

@@ -109,12 +109,12 @@ def foothold_loss(
       params: of `networks.footholds` alone.
       normaliser: of the observation.
       seen: 'state' (.., S).
-      rest: (.., 12) the residuals' means without what the footholds add to them.
+      rest: (.., 12) the residuals' means before tanh without what the footholds add to them.
       guidance: (.., ...).
       networks: whose footholds are judged.
     """
     assert networks.footholds is not None
-    added = networks.footholds(normaliser, params, seen)
+    added = networks.footholds(normaliser, params, seen, rest)
     before = [(0, 0)] * (added.ndim - 1)
     action = jnp.pad(jnp.tanh(rest + added), [*before, (RESIDUALS.start, 0)])  # only its residuals are judged
     return jnp.mean(guide.cost(guidance, action) + guide.idle(guidance, added))

@@ -69,8 +69,8 @@ class NetworkConfig:
     initial_std: float = 0.3
     """Standard deviation of the action, before tanh, of an untrained policy."""
     foothold_head: int = 64
-    """Width of the layers of a network of its own that adds to the residuals what leads feet to footholds. There is one
-    where the terrain has pits and a scripted guide teaches it (`ppo.guide`). 0: none."""
+    """Width of the layers of a network of its own that takes over the residuals where feet must be led to footholds.
+    There is one where the terrain has pits and a scripted guide teaches it (`ppo.guide`). 0: none."""
     feet: int = 4
     """Feet whose heights stand at the end of the observation."""
 
@@ -121,6 +121,8 @@ def _head_bias(initial_std: float) -> Callable[..., jax.Array]:
 
 SMALL = nn.initializers.variance_scaling(0.01**2, "fan_in", "truncated_normal")
 """Of layers that give actions."""
+UNLED = -2.0
+"""Logit of the share that an untrained part for footholds has in the residuals."""
 
 
 def _feet(c: NetworkConfig, heights: jax.Array) -> jax.Array:
@@ -131,34 +133,41 @@ def _feet(c: NetworkConfig, heights: jax.Array) -> jax.Array:
     return foot
 
 
-def _legs(c: NetworkConfig, width: int, foot: jax.Array, context: jax.Array) -> jax.Array:
+def _legs(c: NetworkConfig, width: int, foot: jax.Array, context: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Layers of the module that calls it: what each foot sees (.., 4, F) and a context (.., X) of all legs to the
-    residuals (.., 12), weights shared by the legs.
+    residuals (.., 12), and the layer (.., 4, W) before them; weights shared by the legs.
     """
     context = Dense(c.feet * c.leg_context, name="to_legs")(context)
     context = context.reshape(*foot.shape[:-1], c.leg_context)
     leg = nn.elu(Dense(width, name="leg")(jnp.concatenate([foot, context], axis=-1)))
-    leg = Dense(3, kernel_init=SMALL, name="leg_action")(leg) * LEG_SIGN
-    return leg.reshape(*leg.shape[:-2], 3 * c.feet)
+    residuals = Dense(3, kernel_init=SMALL, name="leg_action")(leg) * LEG_SIGN
+    return residuals.reshape(*leg.shape[:-2], 3 * c.feet), leg
 
 
 class Footholds(nn.Module):
-    """What leads feet to footholds: normalised proprioception and heights -> residual actions before tanh.
+    """What leads feet to footholds, in place of the rest of the policy where it knows better.
 
-    It has no memory and shares nothing with the rest of the policy, so that it can be taught apart and faster.
+    It has no memory and shares nothing with the rest of the policy, so that it can be taught apart and faster. Each
+    joint's residual is (1 - g) times the rest's and g times its own: where feet have to be led somewhere, what the rest
+    would do with them is no disturbance that it had to guess.
     """
 
     config: NetworkConfig
 
     @nn.compact
-    def __call__(self, proprio: jax.Array, heights: jax.Array) -> jax.Array:
-        """proprio (.., S - 100), heights (.., 100) -> (.., 12)."""
+    def __call__(self, proprio: jax.Array, heights: jax.Array, rest: jax.Array) -> jax.Array:
+        """Normalised proprio (.., S - 100), heights (.., 100), rest (.., 12): the rest's residual actions before tanh.
+
+        Returns what is to be added to those (.., 12).
+        """
         c = self.config
         foot = _feet(c, heights)
         # A trot swings a leg together with the one across.
         pair = jnp.concatenate([foot, foot[..., ::-1, :]], axis=-1)
         context = nn.elu(Dense(c.foothold_head, name="proprio")(proprio))
-        return _legs(c, c.foothold_head, pair, context)
+        own, leg = _legs(c, c.foothold_head, pair, context)
+        share = Dense(3, kernel_init=SMALL, bias_init=nn.initializers.constant(UNLED), name="share")(leg)
+        return nn.sigmoid(share.reshape(own.shape)) * (own - rest)
 
 
 class Policy(nn.Module):
@@ -174,7 +183,8 @@ class Policy(nn.Module):
         """proprio (.., S - 100), heights (.., 100) or None, carry (B, C) from before the first step, is_first (.., 1);
         .. is (B,) for a step, (T, B) for a scan.
 
-        Returns {'action': (.., 2 A), 'carry': (B, C) after the last step}.
+        Returns {'action': (.., 2 A), 'carry': (B, C) after the last step}, and with a part for footholds 'rest':
+        (.., 12), the residuals' means without it.
         """
         c = self.config
         x = nn.elu(Dense(c.encoder, name="proprio")(proprio))
@@ -192,15 +202,13 @@ class Policy(nn.Module):
             2 * self.action_size, kernel_init=SMALL, bias_init=_head_bias(c.initial_std), name="action"
         )
         action = out(y)
-        residuals = []
         if foot is not None and c.leg_head:
-            residuals.append(_legs(c, c.leg_head, foot, y))
-        if heights is not None and c.foothold_head:
-            residuals.append(Footholds(c, name="footholds")(proprio, heights))
-        if residuals:
-            around = (RESIDUALS.start, 2 * self.action_size - RESIDUALS.stop)
-            action = action + jnp.pad(sum(residuals), [*[(0, 0)] * (action.ndim - 1), around])
-        return {"action": action, "carry": carry}
+            action = action.at[..., RESIDUALS].add(_legs(c, c.leg_head, foot, y)[0])
+        if heights is None or not c.foothold_head:
+            return {"action": action, "carry": carry}
+        rest = action[..., RESIDUALS]
+        action = action.at[..., RESIDUALS].add(Footholds(c, name="footholds")(proprio, heights, rest))
+        return {"action": action, "carry": carry, "rest": rest}
 
 
 class Critic(nn.Module):
@@ -222,7 +230,8 @@ class Networks(PPONetworks):
     """Brax's, and the part of the policy that leads feet to footholds, by itself."""
 
     footholds: Callable[..., jax.Array] | None = None
-    """(normaliser, its parameters, 'state' (.., S)) -> (.., 12) residual actions before tanh; None without heights."""
+    """(normaliser, its parameters, 'state' (.., S), the rest's residuals (.., 12) before tanh) -> (.., 12) what it adds
+    to them; None without."""
 
 
 def _size(shape: Any) -> int:
@@ -272,9 +281,9 @@ def make_networks(
             params, _normalised(preprocess_observations_fn, statistics, obs, "privileged_state")
         )
 
-    def footholds_apply(statistics: Any, params: Any, state: jax.Array) -> jax.Array:
+    def footholds_apply(statistics: Any, params: Any, state: jax.Array, rest: jax.Array) -> jax.Array:
         proprio, _ = split(_normalised(preprocess_observations_fn, statistics, {"state": state}, "state"))
-        return Footholds(config).apply({"params": params}, proprio, split(state)[1])
+        return Footholds(config).apply({"params": params}, proprio, split(state)[1], rest)
 
     return Networks(
         footholds=footholds_apply if heights and config.foothold_head else None,

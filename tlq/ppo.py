@@ -24,7 +24,7 @@ from jax.sharding import PartitionSpec as P
 
 from envs import Guidance
 from tlq.loss import foothold_loss, ppo_loss
-from tlq.networks import RESIDUALS, Networks
+from tlq.networks import Networks
 
 AXIS = "data"
 NORMALISED = ("state", "privileged_state")
@@ -102,6 +102,7 @@ class Rollout:
     done: jax.Array  # (T, B)
     truncation: jax.Array  # (T, B)
     guide: Guidance | None  # (T, B, ...) what a guide to footholds says, if there is one
+    rest: jax.Array | None  # (T, B, 12) the residuals' means without the footholds, if the policy has a part for them
 
 
 def make_mesh(num_devices: int = 0) -> Mesh:
@@ -194,7 +195,8 @@ class Learner:
         shared = jax.shard_map(roll, mesh=self.mesh, in_specs=specs[0], out_specs=specs[1], check_vma=False)
         rollout, carry, last = jax.jit(shared)(self._step_constants, state)
         parts = {f.name: getattr(rollout, f.name) for f in dataclasses.fields(rollout)}
-        observation, guidance = parts.pop("observation"), parts.pop("guide")
+        parts = {name: part for name, part in parts.items() if part is not None}
+        observation, guidance = parts.pop("observation"), parts.pop("guide", None)
         guidance = {f"guide_{k}": x for k, x in guidance._asdict().items()} if guidance else {}
         return parts | observation | guidance | {"carry": carry, "last": last}
 
@@ -312,6 +314,7 @@ class Learner:
                 done=after.done,
                 truncation=after.info["truncation"],
                 guide=env_state.info.get("guide"),
+                rest=parameters.get("rest"),
             )
             metrics = {k: jnp.mean(v) for k, v in after.metrics.items()}
             return after, (rollout, dict(metrics, reward=jnp.mean(after.reward)))
@@ -386,10 +389,7 @@ class Learner:
         Returns their parameters, their optimiser's state, and the mean cost () in the last pass.
         """
         c, footholds = self.config, state.params.policy["params"]["footholds"]
-        assert self.networks.footholds is not None
-        seen, acted = rollout.observation["state"], rollout.parameters[..., RESIDUALS]
-        rest = acted - self.networks.footholds(state.normaliser, footholds, seen)
-        data = seen, rest, rollout.guide
+        data = rollout.observation["state"], rollout.rest, rollout.guide
         stride = math.gcd(STRIDE, c.unroll)
         chosen = jnp.repeat(self._minibatches(key, c.guide_epochs), stride, axis=0)
         first = jnp.arange(len(chosen)) % stride

@@ -220,12 +220,15 @@ def initialise(state: TrainState, source: str, config: TrainConfig | None = None
     if config is not None and config.init_spread != 1.0:
         arrays = rescale_spread(arrays, config.init_spread)
     parts = {"params": state.params, "normaliser": state.normaliser}
+    owned = {n: x.shape for n, x in zip(names(parts), jax.tree.leaves(parts), strict=True) if ".footholds." in n}
+    # A part for footholds as it was before learns anew; PPO doesn't train it.
+    afresh = any(name not in arrays or arrays[name].shape != shape for name, shape in owned.items())
     taken = []
 
     def take(name: str, x: jax.Array) -> jax.Array:
         new = arrays.get(name)
-        if new is None and ".footholds." in name:
-            return x  # a policy from before it had them
+        if afresh and name in owned:
+            return x
         if new is None or new.shape != x.shape:
             if name.startswith("params.policy"):
                 has = "missing" if new is None else f"of shape {new.shape}"

@@ -182,6 +182,8 @@ def slow_cost(guidance, action):
     feet = [lead[:, :3] @ action[2 + 3 * i : 5 + 3 * i] + lead[:, 3] for i, lead in enumerate(guidance.lead)]
     for foot, held, hold in zip(feet, guidance.held, guidance.hold, strict=True):
         total += guide.HOLD * hold * sum((foot - held) ** 2) / guide.HELD**2
+    for foot, last, steady in zip(feet, guidance.last, guidance.steady, strict=True):
+        total += steady * sum((foot - last) ** 2) / guide.STEADY**2
     for gaps, leg, weight in zip(guidance.gaps, guidance.legs, guidance.weight, strict=True):
         led = feet[leg]
         inside = np.clip(led, axis[0], axis[-1])
@@ -224,6 +226,8 @@ def test_cost_against_a_loop():
             weight=random.uniform(0, 1, 2).astype(np.float32),
             held=random.normal(scale=0.05, size=(4, 2)).astype(np.float32),
             hold=random.uniform(0, 1, 4).astype(np.float32),
+            last=random.normal(scale=0.05, size=(4, 2)).astype(np.float32),
+            steady=random.uniform(0, 1, 4).astype(np.float32),
         )
         action = random.uniform(-1, 1, 14).astype(np.float32)
         found = guide.cost(jax.tree.map(jnp.asarray, guidance), jnp.asarray(action))
@@ -236,7 +240,7 @@ def test_its_slope_leads_feet_off_the_gaps(exact):
 
     @jax.jit
     def descended(episode):
-        guidance = guide.guide(env, episode, jnp.zeros((4, 2)))
+        guidance = guide.guide(env, episode, jnp.zeros((4, 2)))._replace(steady=jnp.zeros(4))
 
         def gap(action):
             own = action[2:].reshape(4, 3)

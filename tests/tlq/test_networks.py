@@ -160,21 +160,34 @@ def test_proprioception_is_normalised_and_heights_are_not():
     np.testing.assert_array_equal(near, beyond)
 
 
-def test_footholds_are_a_part_of_the_policy_that_adds_to_the_residuals():
+def without_footholds(config):
+    return dataclasses.replace(config, foothold_head=0)
+
+
+def test_footholds_take_over_a_share_of_the_residuals():
     obs = observation()
     networks = make_networks({"state": 110, "privileged_state": 20}, 14, config=SMALL)
     stats = statistics(obs, 0.3, 2.0)
     params = networks.policy_network.init(jax.random.PRNGKey(0))
     params = jax.tree.map(lambda x: x + 0.1 * random(*x.shape), params)
     own = params["params"]["footholds"]
-    without = {"params": dict(params["params"], footholds=jax.tree.map(jnp.zeros_like, own))}
-    both = networks.policy_network.apply(stats, params, obs)["action"]
-    rest = networks.policy_network.apply(stats, without, obs)["action"]
-    added = networks.footholds(stats, own, obs["state"])
+    plain = make_networks({"state": 110, "privileged_state": 20}, 14, config=without_footholds(SMALL))
+    both = networks.policy_network.apply(stats, params, obs)
+    rest = plain.policy_network.apply(stats, params, obs)["action"]
+    np.testing.assert_allclose(both["rest"], rest[..., 2:14], atol=1e-6)
+    added = networks.footholds(stats, own, obs["state"], both["rest"])
     assert float(jnp.abs(added).max()) > 0.01
     expected = np.array(rest)
     expected[..., 2:14] += added  # after frequency and lift; then the raw scales
-    np.testing.assert_allclose(both, expected, atol=1e-6)
+    np.testing.assert_allclose(both["action"], expected, atol=1e-6)
+    # The less of the rest, the larger the share: what it would do is replaced, not added to.
+    more = networks.footholds(stats, own, obs["state"], both["rest"] + 1.0)
+    share = added - more
+    assert ((share > 0) & (share < 1)).all()
+    alone = dict(own, share=jax.tree.map(jnp.zeros_like, own["share"]) | {"bias": jnp.full(3, 100.0)})
+    led = [networks.footholds(stats, alone, obs["state"], rest) + rest for rest in (both["rest"], 3.0)]
+    np.testing.assert_allclose(*led, atol=1e-5)
+    np.testing.assert_allclose(added, share * (led[0] - both["rest"]), atol=1e-5)
 
 
 def test_only_the_action_enters_the_density():

@@ -186,6 +186,8 @@ class Asking(Wrapper):
             weight=jnp.ones(2),
             held=jnp.array([[0.05, 0.0]] * 4),
             hold=jnp.array([1.0, 0.0, 0.0, 0.0]),
+            last=jnp.array([[0.0, -0.05]] * 4),
+            steady=jnp.array([0.0, 0.0, 0.0, 1.0]),
         )
         return state.replace(info=state.info | {"guide": guidance})
 
@@ -215,10 +217,10 @@ def test_a_policy_learns_where_its_guide_sees_ground(head):
         state, metrics = learner.step(state)
     after = float(jnp.mean(guide.cost(said, means(state))))
     residual = np.asarray(means(state))[:, 2:].reshape(-1, 4, 3).mean(axis=0)
-    # One foot to the right, another to the left, so that the middle stays; the third where it was.
+    # One foot to the right, another to the left, so that the middle stays; the others where they were.
     assert residual[1, 1] < -0.5
     assert residual[2, 1] > 0.5
-    np.testing.assert_allclose(residual[0, :2], [0.5, 0.0], atol=0.1)
+    np.testing.assert_allclose(residual[[0, 3], :2], [[0.5, 0.0], [0.0, -0.5]], atol=0.1)
     assert after < 0.6 * before
     assert float(metrics["loss/guide"]) < 0.7 * before  # with what it costs to move legs at all
     # What a failed update would leave.

@@ -236,10 +236,12 @@ def started(head, file):
     return params.policy["params"], initialise(state, str(file)).params.policy["params"]
 
 
-def test_footholds_are_new_to_a_policy_from_before(learner, tmp_path):
-    """They begin as untrained ones do; the rest is the old policy's."""
+@pytest.mark.parametrize("some", [False, True])
+def test_footholds_are_new_to_a_policy_from_before(some, learner, tmp_path):
+    """They begin as untrained ones do, all of them if some are new; the rest is the old policy's."""
     state = learner.init(0)
     arrays = dict(zip(names(state), map(np.asarray, jax.tree.leaves(state)), strict=True))
+    arrays |= {"params.policy.params.footholds.leg.bias": np.ones(8)} if some else {}
     np.savez(tmp_path / "policy.npz", **{n: x for n, x in arrays.items() if n.startswith("params.policy")})
     fresh, taken = started(8, tmp_path / "policy.npz")
     jax.tree.map(np.testing.assert_array_equal, taken["footholds"], fresh["footholds"])
