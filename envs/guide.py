@@ -31,7 +31,7 @@ NEAR = 2
 FARTHER, ANOTHER = 1.0, 2.0
 """What a metre costs from where balance wants the foot, and one from where it is led already; to the reflex a place
 that is nothing but gap costs 1."""
-GAP = 3.0
+GAP = 6.0
 """What it costs to lead a foot to nothing but gap. Robots have balance to spare, but not one footstep."""
 BALANCE = 0.15
 """Seconds of the trunk's excess speed that a foot is placed farther along, as a walking inverted pendulum asks for."""
@@ -43,8 +43,8 @@ HOLD, HELD = 0.5, 0.05
 """What it costs to lead a foot in stance by HELD (m) from where it was led when it came down; with the distance
 squared. A foot that is let go pushes the trunk by as much as it was led aside."""
 ALWAYS, IDLE = 0.05, 1.0
-"""What it costs to move a leg's joints by the whole range of residual angles, with the square; and beyond, where the
-guide asks for nothing."""
+"""What it costs that a leg's joints are moved by the whole range of residual angles, with the square; and, where the
+guide asks for nothing, that footholds have a part in that."""
 STEADY = 0.06
 """Changing the place that a foot in swing is led to by that many metres from one step to the next costs 1, and with the
 square of it: a foot follows its joints' targets late, so where those still move about it comes down beside them."""
@@ -254,8 +254,10 @@ def guide(env: QuadrupedEnv, episode: Episode, held: jax.Array) -> Guidance:
 
 
 def _lead(env: QuadrupedEnv, episode: Episode) -> tuple[jax.Array, jax.Array]:
-    """`Guidance.lead` (4, 2, 4) of the robot's own sides, round the last action: the next doesn't differ by much. And
-    `Guidance.last` (4, 2)."""
+    """`Guidance.lead` (4, 2, 4) and `.last` (4, 2) of the robot's own sides.
+
+    Round the last action: the next doesn't differ by much.
+    """
     core, (target, level) = env.core, _target(env, episode)
     standing = tg.leg.inverse(core.geometry, target)
 
@@ -307,14 +309,20 @@ def cost(guidance: Guidance, action: jax.Array) -> jax.Array:
     return jnp.sum(guidance.weight * each, axis=-1) + both * ACROSS * middle + HOLD * let_go + changed
 
 
-def idle(guidance: Guidance, residual: jax.Array) -> jax.Array:
-    """What it costs (...) that residual actions (..., 12) before tanh move legs which had better be left alone, and to
-    move any more than it takes: lifting a foot leads it nowhere.
+def idle(guidance: Guidance, residual: jax.Array, added: jax.Array) -> jax.Array:
+    """What it costs (...) to move legs any more than it takes: lifting a foot leads it nowhere.
+
+    Args:
+      guidance: (...).
+      residual: residual actions (..., 12) before tanh.
+      added: what a part for footholds added to them (..., 12); nothing, where legs had better be left to the rest.
     """
-    squares = jnp.sum(jnp.square(residual.reshape(*residual.shape[:-1], 4, 3)), axis=-1)
+    squares, changes = (
+        jnp.sum(jnp.square(x.reshape(*x.shape[:-1], 4, 3)), axis=-1) for x in (residual, added)
+    )
     swing = jnp.sum(guidance.weight[..., None] * (guidance.legs[..., None] == jnp.arange(4)), axis=-2)
     asked = jnp.maximum(guidance.hold, swing)
-    return jnp.sum((ALWAYS + IDLE * (1.0 - asked)) * squares, axis=-1)
+    return jnp.sum(ALWAYS * squares + IDLE * (1.0 - asked) * changes, axis=-1)
 
 
 class Guided(Wrapper):
