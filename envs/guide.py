@@ -298,7 +298,9 @@ def cost(guidance: Guidance, action: jax.Array) -> jax.Array:
     residual = action[..., 2:].reshape(*action.shape[:-1], 4, 1, 3)
     feet = jnp.sum(guidance.lead[..., :3] * residual, axis=-1) + guidance.lead[..., 3]
     let_go = jnp.sum(guidance.hold * jnp.sum(jnp.square((feet - guidance.held) / HELD), axis=-1), axis=-1)
-    changed = jnp.sum(guidance.steady * jnp.sum(jnp.square((feet - guidance.last) / STEADY), axis=-1), axis=-1)
+    changed = jnp.sum(
+        guidance.steady * jnp.sum(jnp.square((feet - guidance.last) / STEADY), axis=-1), axis=-1
+    )
     led = jnp.take_along_axis(feet, guidance.legs[..., None], axis=-2)
     beyond = jnp.sum(jnp.maximum(jnp.abs(led) - REACH * CELL, 0.0), axis=-1)
     off = led - guidance.ahead[..., None, :]

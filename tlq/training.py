@@ -220,7 +220,9 @@ def initialise(state: TrainState, source: str, config: TrainConfig | None = None
     if config is not None and config.init_spread != 1.0:
         arrays = rescale_spread(arrays, config.init_spread)
     parts = {"params": state.params, "normaliser": state.normaliser}
-    owned = {n: x.shape for n, x in zip(names(parts), jax.tree.leaves(parts), strict=True) if ".footholds." in n}
+    owned = {
+        n: x.shape for n, x in zip(names(parts), jax.tree.leaves(parts), strict=True) if ".footholds." in n
+    }
     # A part for footholds as it was before learns anew; PPO doesn't train it.
     afresh = any(name not in arrays or arrays[name].shape != shape for name, shape in owned.items())
     taken = []
