@@ -43,8 +43,9 @@ HOLD, HELD = 0.5, 0.05
 """What it costs to lead a foot in stance by HELD (m) from where it was led when it came down; with the distance
 squared. A foot that is let go pushes the trunk by as much as it was led aside."""
 ALWAYS, IDLE = 0.05, 1.0
-"""What it costs that a leg's joints are moved by the whole range of residual angles, with the square; and, where the
-guide asks for nothing, that footholds have a part in that."""
+"""What it costs to move a leg's joints by the whole range of residual angles from where the rest of the policy would
+have them, with the square; and beyond, where the guide asks for nothing. That holds for asked legs, too: how long a leg
+in stance is keeps the balance, which the guide knows nothing of."""
 STEADY = 0.06
 """Changing the place that a foot in swing is led to by that many metres from one step to the next costs 1, and with the
 square of it: a foot follows its joints' targets late, so where those still move about it comes down beside them."""
@@ -311,20 +312,14 @@ def cost(guidance: Guidance, action: jax.Array) -> jax.Array:
     return jnp.sum(guidance.weight * each, axis=-1) + both * ACROSS * middle + HOLD * let_go + changed
 
 
-def idle(guidance: Guidance, residual: jax.Array, added: jax.Array) -> jax.Array:
-    """What it costs (...) to move legs any more than it takes: lifting a foot leads it nowhere.
-
-    Args:
-      guidance: (...).
-      residual: residual actions (..., 12) before tanh.
-      added: what a part for footholds added to them (..., 12); nothing, where legs had better be left to the rest.
+def idle(guidance: Guidance, added: jax.Array) -> jax.Array:
+    """What it costs (...) that footholds add (..., 12) before tanh to residuals of legs which had better be left alone,
+    and to add any more than it takes: lifting a foot leads it nowhere.
     """
-    squares, changes = (
-        jnp.sum(jnp.square(x.reshape(*x.shape[:-1], 4, 3)), axis=-1) for x in (residual, added)
-    )
+    squares = jnp.sum(jnp.square(added.reshape(*added.shape[:-1], 4, 3)), axis=-1)
     swing = jnp.sum(guidance.weight[..., None] * (guidance.legs[..., None] == jnp.arange(4)), axis=-2)
     asked = jnp.maximum(guidance.hold, swing)
-    return jnp.sum(ALWAYS * squares + IDLE * (1.0 - asked) * changes, axis=-1)
+    return jnp.sum((ALWAYS + IDLE * (1.0 - asked)) * squares, axis=-1)
 
 
 class Guided(Wrapper):

@@ -115,7 +115,6 @@ def foothold_loss(
     """
     assert networks.footholds is not None
     added = networks.footholds(normaliser, params, seen, rest)
-    residual = rest + added
-    before = [(0, 0)] * (residual.ndim - 1)
-    action = jnp.pad(jnp.tanh(residual), [*before, (RESIDUALS.start, 0)])  # only its residuals are judged
-    return jnp.mean(guide.cost(guidance, action) + guide.idle(guidance, residual, added))
+    before = [(0, 0)] * (added.ndim - 1)
+    action = jnp.pad(jnp.tanh(rest + added), [*before, (RESIDUALS.start, 0)])  # only its residuals are judged
+    return jnp.mean(guide.cost(guidance, action) + guide.idle(guidance, added))
