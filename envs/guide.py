@@ -31,7 +31,7 @@ NEAR = 2
 FARTHER, ANOTHER = 1.0, 2.0
 """What a metre costs from where balance wants the foot, and one from where it is led already; to the reflex a place
 that is nothing but gap costs 1."""
-GAP = 6.0
+GAP = 3.0
 """What it costs to lead a foot to nothing but gap. Robots have balance to spare, but not one footstep."""
 BALANCE = 0.15
 """Seconds of the trunk's excess speed that a foot is placed farther along, as a walking inverted pendulum asks for."""

@@ -102,9 +102,7 @@ class Rollout:
     done: jax.Array  # (T, B)
     truncation: jax.Array  # (T, B)
     guide: Guidance | None  # (T, B, ...) what a guide to footholds says, if there is one
-    rest: (
-        jax.Array | None
-    )  # (T, B, 12) the residuals' means without the footholds, if the policy has a part for them
+    rest: jax.Array | None  # (T, B, 12) the residuals' means but for the footholds' part, if there is one
 
 
 def make_mesh(num_devices: int = 0) -> Mesh:
