@@ -261,6 +261,10 @@ def policy_graph(policy: Any, arrays: Mapping[str, np.ndarray], heights: int) ->
     actions = arrays[f"{_PARAMS}action.bias"].size // 2
     mean, _ = b.split(b.dense("action", y), actions, actions)
     led = any(name.startswith(f"{_PARAMS}footholds.") for name in arrays)
+    if led and f"{_PARAMS}footholds.share.kernel" not in arrays:
+        raise ValueError(
+            "the policy's part for footholds is of an older version; train.py init= starts from the rest"
+        )
     if heights and (policy.leg_head or led):
         shared, residuals = b.split(mean, RESIDUALS.start, actions - RESIDUALS.start)
         if policy.leg_head:

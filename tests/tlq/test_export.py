@@ -163,6 +163,15 @@ def test_a_network_of_another_environment_is_refused(made, tmp_path):
     assert not os.listdir(tmp_path)
 
 
+def test_footholds_of_an_older_version_are_refused(made, tmp_path):
+    parts = made.params["params"]
+    older = {name: x for name, x in parts["footholds"].items() if name != "share"}
+    params = {"params": dict(parts, footholds=older)}
+    with pytest.raises(ValueError, match="footholds is of an older version"):
+        tlq.export.export_policy(tmp_path / "policy.npz", made.config, params, made.normaliser)
+    assert not os.listdir(tmp_path)
+
+
 NODE = {"op": "Tanh", "inputs": ["observation"], "outputs": ["action"], "attributes": {}}
 
 
