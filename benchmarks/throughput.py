@@ -41,7 +41,6 @@ from envs.limits import check_values  # noqa: E402
 from envs.robot import robot_spec  # noqa: E402
 from tlq import cli  # noqa: E402
 from tlq import config as settings  # noqa: E402
-from tlq.ppo import NORMALISED  # noqa: E402
 from tlq.training import make_learner  # noqa: E402
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -91,22 +90,18 @@ class Environments:
 
     def sizes(self) -> dict[str, float]:
         """Bytes of an environment's state, of its part of a rollout, of a terrain; number of parameters."""
-        learner = self.learner
-        here = jax.eval_shape(lambda: self.state.env_state.obs)
-        row = sum(here[k].size for k in (*NORMALISED, "is_first")) / self.config.num_envs
-        # Action, its distribution; log-probability, reward, done, truncation.
-        row += 3 * learner.env.action_size + 4
-        guided = _bytes(self.state.env_state.info.get("guide")) / self.config.num_envs
+        batch = jax.eval_shape(self.learner.batch, self.state)
+        rollout = {name: part for name, part in batch.items() if name not in ("carry", "last")}
         return {
             "bytes_per_env": _bytes(self.state.env_state) / self.config.num_envs,
-            "rollout_bytes_per_env": (4 * row + guided) * self.config.ppo.unroll,
+            "rollout_bytes_per_env": _bytes(rollout) / self.config.num_envs,
             "bytes_per_terrain": self.bank.nbytes / self.bank.num_terrains,
             "parameters": sum(x.size for x in jax.tree.leaves(self.state.params)),
         }
 
 
 def _bytes(tree: Any) -> int:
-    return sum(x.nbytes for x in jax.tree.leaves(tree))
+    return sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(tree))
 
 
 def rates(sides: dict[str, tuple[Callable[[], None], int]], rounds: int) -> dict[str, float]:

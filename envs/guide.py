@@ -224,9 +224,7 @@ class Guidance(NamedTuple):
     hold: jax.Array
     """(4,) how much that counts, 0 in swing."""
     last: jax.Array
-    """(4, 2) m, where the last action would lead the feet."""
-    steady: jax.Array
-    """(4,) how much it counts to lead them there again, 0 where they had better be left alone."""
+    """(2, 2) m, where the last action would lead the two feet in swing."""
 
 
 def guide(env: QuadrupedEnv, episode: Episode, held: jax.Array) -> Guidance:
@@ -247,15 +245,14 @@ def guide(env: QuadrupedEnv, episode: Episode, held: jax.Array) -> Guidance:
         weight=jnp.where(s.asked, s.share, 0.0),
         held=held,
         hold=jnp.where(stance, jnp.clip(jnp.linalg.norm(held, axis=-1) / LED, 0.0, 1.0), 0.0),
-        last=last,
-        steady=jnp.zeros(4).at[s.legs].set(jnp.where(s.asked, s.share, 0.0)),
+        last=last[s.legs],
     )
     mirror = env.core.update_mirror(controller.mirror, env.heading_command(episode))
     return jax.tree.map(lambda mine, other: jnp.where(mirror > 0, mine, other), own, _mirrored(own))
 
 
 def _lead(env: QuadrupedEnv, episode: Episode) -> tuple[jax.Array, jax.Array]:
-    """`Guidance.lead` (4, 2, 4) and `.last` (4, 2) of the robot's own sides.
+    """`Guidance.lead` (4, 2, 4) of the robot's own sides, and where the last action would lead the feet (4, 2) m.
 
     Round the last action: the next doesn't differ by much.
     """
@@ -285,8 +282,7 @@ def _mirrored(guidance: Guidance) -> Guidance:
         weight=guidance.weight,
         held=guidance.held[swapped] * side,
         hold=guidance.hold[swapped],
-        last=guidance.last[swapped] * side,
-        steady=guidance.steady[swapped],
+        last=guidance.last * side,
     )
 
 
@@ -299,17 +295,15 @@ def cost(guidance: Guidance, action: jax.Array) -> jax.Array:
     residual = action[..., 2:].reshape(*action.shape[:-1], 4, 1, 3)
     feet = jnp.sum(guidance.lead[..., :3] * residual, axis=-1) + guidance.lead[..., 3]
     let_go = jnp.sum(guidance.hold * jnp.sum(jnp.square((feet - guidance.held) / HELD), axis=-1), axis=-1)
-    changed = jnp.sum(
-        guidance.steady * jnp.sum(jnp.square((feet - guidance.last) / STEADY), axis=-1), axis=-1
-    )
     led = jnp.take_along_axis(feet, guidance.legs[..., None], axis=-2)
     beyond = jnp.sum(jnp.maximum(jnp.abs(led) - REACH * CELL, 0.0), axis=-1)
     off = led - guidance.ahead[..., None, :]
     far = jnp.sqrt(jnp.sum(jnp.square(off), axis=-1) + 1e-6)  # a slope at 0, too
-    each = GAP * between(guidance.gaps.astype(jnp.float32), led) + FARTHER * far + BEYOND * beyond
+    moved = jnp.sum(jnp.square((led - guidance.last) / STEADY), axis=-1)
+    each = GAP * between(guidance.gaps.astype(jnp.float32), led) + FARTHER * far + BEYOND * beyond + moved
     middle = jnp.abs(jnp.sum(jnp.mean(off, axis=-2) * guidance.across, axis=-1))
     both = jnp.min(guidance.weight, axis=-1)
-    return jnp.sum(guidance.weight * each, axis=-1) + both * ACROSS * middle + HOLD * let_go + changed
+    return jnp.sum(guidance.weight * each, axis=-1) + both * ACROSS * middle + HOLD * let_go
 
 
 def idle(guidance: Guidance, added: jax.Array) -> jax.Array:

@@ -160,10 +160,6 @@ def test_proprioception_is_normalised_and_heights_are_not():
     np.testing.assert_array_equal(near, beyond)
 
 
-def without_footholds(config):
-    return dataclasses.replace(config, foothold_head=0)
-
-
 def test_footholds_take_over_a_share_of_the_residuals():
     obs = observation()
     networks = make_networks({"state": 110, "privileged_state": 20}, 14, config=SMALL)
@@ -171,7 +167,8 @@ def test_footholds_take_over_a_share_of_the_residuals():
     params = networks.policy_network.init(jax.random.PRNGKey(0))
     params = jax.tree.map(lambda x: x + 0.1 * random(*x.shape), params)
     own = params["params"]["footholds"]
-    plain = make_networks({"state": 110, "privileged_state": 20}, 14, config=without_footholds(SMALL))
+    without = dataclasses.replace(SMALL, foothold_head=0)
+    plain = make_networks({"state": 110, "privileged_state": 20}, 14, config=without)
     both = networks.policy_network.apply(stats, params, obs)
     rest = plain.policy_network.apply(stats, params, obs)["action"]
     np.testing.assert_allclose(both["rest"], rest[..., 2:14], atol=1e-6)
@@ -180,14 +177,13 @@ def test_footholds_take_over_a_share_of_the_residuals():
     expected = np.array(rest)
     expected[..., 2:14] += added  # after frequency and lift; then the raw scales
     np.testing.assert_allclose(both["action"], expected, atol=1e-6)
-    # The less of the rest, the larger the share: what it would do is replaced, not added to.
-    more = networks.footholds(stats, own, obs["state"], both["rest"] + 1.0)
-    share = added - more
+    # Of whatever the rest does more, a share is taken back: it is replaced, not added to.
+    share = added - networks.footholds(stats, own, obs["state"], both["rest"] + 1.0)
     assert ((share > 0) & (share < 1)).all()
     alone = dict(own, share=jax.tree.map(jnp.zeros_like, own["share"]) | {"bias": jnp.full(3, 100.0)})
-    led = [networks.footholds(stats, alone, obs["state"], rest) + rest for rest in (both["rest"], 3.0)]
-    np.testing.assert_allclose(*led, atol=1e-5)
-    np.testing.assert_allclose(added, share * (led[0] - both["rest"]), atol=1e-5)
+    taken_over = [networks.footholds(stats, alone, obs["state"], r) + r for r in (both["rest"], 3.0)]
+    np.testing.assert_allclose(*taken_over, atol=1e-5)
+    np.testing.assert_allclose(added, share * (taken_over[0] - both["rest"]), atol=1e-5)
 
 
 def test_only_the_action_enters_the_density():
