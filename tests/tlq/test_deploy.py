@@ -88,12 +88,12 @@ def test_two_seconds_over_loopback(file, tmp_path, capsys):
     assert json.loads(capsys.readouterr().out) == report
     robot, policy = report["robot"], report["policy_process"]
     assert robot["seconds"] == pytest.approx(2.0, abs=0.01) or robot["fell"]
-    # Other programs may be using the machine: counts and order are checked, figures hardly.
+    # Other programs may be using the machine: counts and order are checked, figures only where load can't change them.
     assert 0 < robot["messages"]["targets"] <= policy["steps"]
     assert policy["modes"]["walk"] > 0 and policy["faults"]["malformed"] == 0
     for times in (robot["pd_period_ms"], robot["round_trip_ms"], policy["period_ms"], policy["step_ms"]):
         assert 0 < times["median"] <= times["p99"] <= times["worst"]
-    assert policy["period_ms"]["median"] == pytest.approx(20.0, abs=10.0)
+    assert policy["period_ms"]["median"] > 10.0  # 20 ms; a busy machine takes longer, but nothing makes it run ahead
 
 
 def test_the_policys_process_answers_and_ends_with_its_parent(file):
