@@ -93,7 +93,8 @@ def test_two_seconds_over_loopback(file, tmp_path, capsys):
     assert policy["modes"]["walk"] > 0 and policy["faults"]["malformed"] == 0
     for times in (robot["pd_period_ms"], robot["round_trip_ms"], policy["period_ms"], policy["step_ms"]):
         assert 0 < times["median"] <= times["p99"] <= times["worst"]
-    assert policy["period_ms"]["median"] > 10.0  # 20 ms; a busy machine takes longer, but nothing makes it run ahead
+    # The period is 20 ms; a busy machine takes longer, but nothing makes it run ahead.
+    assert policy["period_ms"]["median"] > 10.0
 
 
 def test_the_policys_process_answers_and_ends_with_its_parent(file):
