@@ -1,5 +1,10 @@
 """The quadruped environment on MJX."""
 
+import contextlib
+
+with contextlib.redirect_stdout(None):  # MJX prints there that the optional warp isn't installed
+    from mujoco import mjx as _  # noqa: F401
+
 from envs.auto_reset import AutoReset
 from envs.config import EVALUATION_ITERATIONS, METHODS, CurriculumConfig, EnvConfig, RandomisationConfig
 from envs.env import GOAL, QuadrupedEnv
