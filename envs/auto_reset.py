@@ -8,7 +8,7 @@ from envs.env import QuadrupedEnv
 
 
 class AutoReset(Wrapper):
-    """Starts a new episode in the step that ends one: new terrain, command, phase, level.
+    """Starts a new episode in the step that ends one: new terrain of the same kind, new command, phase, level.
 
     Unlike Brax's wrapper it restores everything an episode has, draws it anew, and computes one observation instead of
     two: the reset happens before the observation. The step that ends an episode has `done` 1.
@@ -31,7 +31,7 @@ class AutoReset(Wrapper):
         fell = done & (state.info["truncation"] == 0)
         level = jnp.where(done, self.env.next_level(ended, state.info["level"], fell), state.info["level"])
         # The next step's key may be NaN-free even if the physics exploded: it doesn't depend on it.
-        fresh = self.env.begin(jax.random.fold_in(ended.key, 3), level)
+        fresh = self.env.begin(jax.random.fold_in(ended.key, 3), level, ended.terrain)
         episode = jax.tree.map(lambda new, old: jnp.where(done, new, old), fresh, ended)
         return state.replace(
             pipeline_state=episode, obs=self.env.observe(episode), info=state.info | {"level": level}

@@ -46,6 +46,7 @@ class QuadrupedEnv(Env):
         self._data = mjx.make_data(self._model)
         self._planes = physics.plane_ids(self.mj_model, config.num_planes)
         self._near = tg.samples.within(config.rewards.terrain_ring)
+        self._instances, self._counts = self._by_kind()
 
     # -- Brax's interface
 
@@ -111,13 +112,34 @@ class QuadrupedEnv(Env):
         """Names in `state.metrics`."""
         terms = ("along", "across", "smooth", "energy", "terrain", "aim", "height", "yaw", "heading", "tilt")
         ends = ("ended", "distance", "length", "fell", "level", "exploded")
-        return (*(f"reward/{t}" for t in terms), *(f"episode/{e}" for e in ends), "speed", "lift", "level")
+        kinds = (f"{part}/{kind}" for kind in self.mixture for part in ("share", "level"))
+        return (
+            *(f"reward/{t}" for t in terms),
+            *(f"episode/{e}" for e in ends),
+            *kinds,
+            "speed",
+            "lift",
+            "level",
+        )
 
-    def begin(self, key: jax.Array, level: jax.Array) -> Episode:
-        """A new episode on a level () int32 of the ladder."""
+    @functools.cached_property
+    def mixture(self) -> dict[str, int]:
+        """Kinds of terrain in its bank, with their `Bank.kind_id`; empty where there is but one."""
+        ids = sorted({int(i) for i in np.asarray(self.bank.kind_id)})
+        return {self.bank.kinds[i]: i for i in ids} if len(ids) > 1 else {}
+
+    def begin(self, key: jax.Array, level: jax.Array, terrain: jax.Array | None = None) -> Episode:
+        """A new episode on a level () int32 of the ladder.
+
+        Args:
+          key: random key.
+          level: of the ladder, () int32.
+          terrain: () int32, an instance of the bank whose kind the new one is to be of, too. A level says little about
+            another kind: a robot that climbs high blocks may fall on the easiest stones. None: any kind.
+        """
         c = self.config
         keys = iter(jax.random.split(key, 11))
-        level, terrain, practice = self._draw_terrain([next(keys) for _ in range(5)], level)
+        level, place, practice = self._draw_terrain([next(keys) for _ in range(5)], level, terrain)
         xy = jax.random.uniform(next(keys), (2,), minval=-1.0, maxval=1.0) * c.spawn_offset
         yaw, angle = jax.random.uniform(next(keys), (2,), minval=-1.0, maxval=1.0) * jnp.array(
             [c.spawn_yaw, jnp.pi]
@@ -126,7 +148,7 @@ class QuadrupedEnv(Env):
         phase = jnp.where(jax.random.bernoulli(next(keys)), 0.5, -0.5) * jnp.float32(jnp.pi)
         walk = jax.random.uniform(next(keys)) >= c.stand_share
         command = jnp.where(walk, jnp.stack([jnp.cos(angle), jnp.sin(angle)]), 0.0)
-        ground = terrains.height(self.bank, terrain, xy)
+        ground = terrains.height(self.bank, place, xy)
         qpos = jnp.asarray(self.standing, jnp.float32)
         # Yaw times the settled pitch.
         (w, _, y, _), cos, sin = self.standing[3:7], jnp.cos(yaw / 2), jnp.sin(yaw / 2)
@@ -140,10 +162,10 @@ class QuadrupedEnv(Env):
             warmstart=jnp.zeros(18),
             torque=jnp.zeros(12),
             controller=self.core.initial_state(phase),
-            terrain=terrain,
+            terrain=place,
             level=level,
             practice=practice,
-            floor=jnp.maximum(self.bank.floor[terrain], -depth),
+            floor=jnp.maximum(self.bank.floor[place], -depth),
             command=command,
             origin=xy,
             heading=yaw,
@@ -154,19 +176,47 @@ class QuadrupedEnv(Env):
             key=next(keys),
         )
 
+    def _by_kind(self) -> tuple[np.ndarray, np.ndarray]:
+        """Instances (N + 1, levels, M) int32 of the bank by kind id and level of the ladder; how many (N + 1, levels).
+
+        Last the instances of any kind, which also stand in where the bank has none of a kind.
+        """
+        instance, kind = np.arange(self.bank.num_terrains), np.asarray(self.bank.kind_id)
+        any_kind = len(self.bank.kinds)
+        lists = [
+            [
+                np.flatnonzero((instance % self.levels == level) & ((kind == k) | (k == any_kind)))
+                for level in range(self.levels)
+            ]
+            for k in range(any_kind + 1)
+        ]
+        for level, found in enumerate(lists[any_kind]):
+            if len(found) == 0:  # a bank of fewer terrains than levels
+                lists[any_kind][level] = np.array([level % self.bank.num_terrains])
+        counts = np.array([[len(found) for found in row] for row in lists])
+        places = np.zeros((*counts.shape, counts.max()), np.int32)
+        for k, row in enumerate(lists):
+            for level, found in enumerate(row):
+                chosen = found if len(found) else lists[any_kind][level]
+                counts[k, level] = len(chosen)
+                places[k, level, : len(chosen)] = chosen
+        return places, counts
+
     def _draw_terrain(
-        self, keys: list[jax.Array], level: jax.Array
+        self, keys: list[jax.Array], level: jax.Array, like: jax.Array | None
     ) -> tuple[jax.Array, jax.Array, jax.Array]:
         """Level, instance in the bank and whether footholds are practised, from the level of the ladder; each ()."""
         c = self.config.curriculum
         lower = jax.random.randint(keys[0], (), 0, jnp.maximum(level, 1))
         level = jnp.where(jax.random.uniform(keys[1]) < c.revisit, lower, level)
         practised = jax.random.randint(keys[2], (), 0, self.levels)
-        row = jax.random.randint(keys[3], (), 0, max(self.bank.num_terrains // self.levels, 1))
+        kind = len(self.bank.kinds) if like is None else self.bank.kind_id[like]
+        number = jax.random.uniform(keys[3])
 
         def place(level: jax.Array) -> jax.Array:
-            # Instance k has difficulty k % levels.
-            return (row * self.levels + level) % self.bank.num_terrains
+            count = jnp.asarray(self._counts)[kind, level]
+            row = jnp.minimum((number * count).astype(jnp.int32), count - 1)
+            return jnp.asarray(self._instances)[kind, level, row]
 
         pit = self.bank.floor[place(practised)] < -self.config.rewards.gap_threshold
         practice = c.enabled & pit & (jax.random.uniform(keys[4]) < c.practice)
@@ -214,6 +264,9 @@ class QuadrupedEnv(Env):
             "lift": jnp.mean(controller.lift),
             "level": self._share(state.info["level"]),
         }
+        for name, number in self.mixture.items():
+            share = jnp.float32(self.bank.kind_id[after.terrain] == number)
+            metrics |= {f"share/{name}": share, f"level/{name}": share * metrics["level"]}
         return state.replace(
             pipeline_state=after,
             reward=reward,

@@ -418,13 +418,16 @@ def summarise(means: dict[str, jax.Array], steps: int) -> dict[str, jax.Array]:
     """Figures of an iteration from the means over its `steps` steps of the environment's metrics.
 
     What an environment reports as 'episode/<x>' is zero but at an episode's end, so a mean over episodes is a ratio
-    of two means over steps. Without an episode's end the ratios are nan.
+    of two means over steps. Without an episode's end the ratios are nan. Likewise 'level/<kind of terrain>' is zero
+    where an environment is of another kind, and 'share/<kind>' 1 where it isn't.
     """
     ended = means.get("episode/ended", jnp.float32(0))
     figures = {k: v for k, v in means.items() if not k.startswith("episode/")}
     for key, value in means.items():
         if key.startswith("episode/") and key != "episode/ended":
             figures[key] = value / ended
+        if key.startswith("level/"):
+            figures[key] = value / means[key.replace("level", "share", 1)]
     return dict(figures, episodes=ended * steps)
 
 

@@ -361,6 +361,13 @@ def test_auto_reset_climbs_and_descends(noisy):
         episode = after.pipeline_state
         assert int(episode.level) <= expected or bool(episode.practice)
         assert after.metrics["episode/level"] == pytest.approx(4 / 11)
+        kinds = np.asarray(noisy.env.bank.kind_id)
+        was = state.pipeline_state.terrain
+        name = noisy.env.bank.kinds[kinds[was]]
+        assert after.metrics[f"share/{name}"] == 1.0
+        assert after.metrics[f"level/{name}"] == pytest.approx(4 / 11)
+        fitting = (kinds == kinds[was]) & (np.arange(len(kinds)) % noisy.env.levels == int(episode.level))
+        assert fitting[int(episode.terrain)] or not fitting.any()
 
 
 def test_levels_at_the_start_and_revisits(exact):
@@ -380,6 +387,31 @@ def test_levels_at_the_start_and_revisits(exact):
     assert practice.mean() == pytest.approx(c.practice * share, abs=0.05)
     starts = np.asarray(jax.jit(jax.vmap(lambda key: exact.env.reset(key).info["level"]))(keys))
     assert set(starts) == set(range(c.start + 1))
+
+
+def test_the_next_terrain_is_of_the_same_kind(exact):
+    """A ladder of its own for every kind: of the instances of that kind and level each one is drawn as often."""
+    env = exact.env
+    kind, levels = np.asarray(env.bank.kind_id), np.arange(env.bank.num_terrains) % env.levels
+    keys = jax.random.split(jax.random.key(1), 300)
+    begin = jax.jit(jax.vmap(env.begin, in_axes=(0, None, None)))
+    missing = 0
+    for before in range(8):
+        begun = begin(keys, jnp.int32(6), jnp.int32(before))
+        drawn = np.asarray(begun.terrain)
+        np.testing.assert_array_equal(levels[drawn], begun.level)
+        for level in range(env.levels):
+            fitting = np.flatnonzero((levels == level) & (kind == kind[before]))
+            missing += len(fitting) == 0
+            here = drawn[np.asarray(begun.level) == level]
+            allowed = fitting if len(fitting) else np.flatnonzero(levels == level)
+            assert np.isin(here, allowed).all()
+            if level == 6:
+                counts = [np.sum(here == k) for k in allowed]
+                assert np.min(counts) > 0.3 * np.max(counts)
+    assert missing  # a small bank doesn't have every kind on every level
+    several = {env.bank.kinds[i] for i in kind}
+    assert set(env.mixture) == several and {f"level/{name}" for name in several} < set(env.metric_names)
 
 
 # Observation ------------------------------------------------------------------------------------------------------

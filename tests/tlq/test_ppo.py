@@ -280,10 +280,13 @@ def test_the_learning_rate_follows_the_kl():
 def test_figures_of_episodes_are_means_over_episodes():
     # 2 of 8 steps end an episode, at 3 m and 5 m, one of them by a fall.
     means = {"episode/ended": 2 / 8, "episode/distance": 8 / 8, "episode/fell": 1 / 8, "reward": 0.5}
+    # A quarter of the environments has stairs, at levels whose mean is 0.4.
+    means |= {"share/stairs": 1 / 4, "level/stairs": 0.1}
     figures = summarise(jax.tree.map(jnp.float32, means), 8)
-    assert {k: float(v) for k, v in figures.items()} == {
+    assert {k: float(v) for k, v in figures.items()} == pytest.approx({
         "episode/distance": 4.0, "episode/fell": 0.5, "reward": 0.5, "episodes": 2.0,
-    }  # fmt: skip
+        "share/stairs": 0.25, "level/stairs": 0.4,
+    })  # fmt: skip
 
 
 def test_environments_that_cannot_be_split_evenly_are_refused():
