@@ -41,6 +41,7 @@ LIMITS: dict[str, tuple[float, float]] = {
     "policy.leg_context": _WIDTH,
     "policy.critic": _WIDTH,
     "policy.initial_std": (0.01, 10.0),
+    "policy.min_std": (1e-4, 1.0),
     "policy.feet": (4, 4),
     "ppo.unroll": (1, 10_000),
     "ppo.epochs": (1, 1000),
@@ -87,8 +88,8 @@ class TrainConfig:
     init: str = ""
     """Run folder or policy file whose parameters and normaliser to start from."""
     init_spread: float = 1.0
-    """Factor on the spread with which the policy that `init` names explores: one that walks, but on narrow footholds
-    stumbles over its own exploration, goes on better with less."""
+    """Factor on the spread, beyond `policy.min_std`, with which the policy that `init` names explores: one that walks,
+    but on narrow footholds stumbles over its own exploration, goes on better with less."""
     devices: int = 0
     """Devices to use; 0: all of them."""
     coordinator: str = ""
@@ -349,6 +350,8 @@ def validate(config: TrainConfig) -> None:
         raise UsageError(str(error)) from None
     if not config.policy.foot_encoder or not config.policy.critic:
         raise UsageError("policy.foot_encoder and policy.critic need at least one layer each")
+    if config.policy.min_std >= config.policy.initial_std:
+        raise UsageError("policy.min_std must be below policy.initial_std")
     if config.ppo.learning_rate_min > config.ppo.learning_rate_max:
         raise UsageError("ppo.learning_rate_min must not be above ppo.learning_rate_max")
     if not 0 <= config.process < config.processes:

@@ -23,7 +23,6 @@ import tg
 from tlq.memory import Dense, Memory, carry_size
 
 CLIP = 10.0  # normalised observations are clipped to +-CLIP standard deviations
-MIN_STD = 0.001
 
 SAME_SIDE = np.array(
     [
@@ -39,7 +38,7 @@ LEG_SIGN = np.array([[1, 1, 1], [-1, 1, 1]] * 2, np.float32)
 """(4, 3) turns a left leg's residuals (abduction, hip, knee) into the same leg's."""
 
 
-BEFORE = {"foothold_head": 0}
+BEFORE = {"foothold_head": 0, "min_std": 0.001}
 """Settings that older runs don't name, as they were."""
 
 
@@ -68,6 +67,9 @@ class NetworkConfig:
     """Hidden widths of the critic."""
     initial_std: float = 0.3
     """Standard deviation of the action, before tanh, of an untrained policy."""
+    min_std: float = 0.05
+    """Lower bound of that deviation, so that a policy goes on exploring. Without one, poles27 ended at 0.03 and stood
+    still (docs/experiments.md)."""
     foothold_head: int = 64
     """Width of the layers of a network of its own that takes over the residuals where feet must be led to footholds.
     There is one where the terrain has pits and a scripted guide teaches it (`ppo.guide`). 0: none."""
@@ -108,12 +110,12 @@ class RecurrentNormalTanh(NormalTanhDistribution):
         return super().log_prob(parameters, actions["action"])
 
 
-def _head_bias(initial_std: float) -> Callable[..., jax.Array]:
-    """Bias of [mean | raw scale]: mean 0 and softplus(raw) + MIN_STD = initial_std."""
+def _head_bias(initial_std: float, min_std: float) -> Callable[..., jax.Array]:
+    """Bias of [mean | raw scale]: mean 0 and softplus(raw) + min_std = initial_std."""
 
     def init(key: jax.Array, shape: tuple[int, ...], dtype: Any = jnp.float32) -> jax.Array:
         half = shape[0] // 2
-        raw = jnp.log(jnp.expm1(initial_std - MIN_STD))
+        raw = jnp.log(jnp.expm1(initial_std - min_std))
         return jnp.concatenate([jnp.zeros(half), jnp.full(half, raw)]).astype(dtype)
 
     return init
@@ -199,7 +201,10 @@ class Policy(nn.Module):
         # x skips the memory, so that reflexes don't have to pass through it.
         y = nn.elu(Dense(c.head, name="head")(jnp.concatenate([x, y], axis=-1)))
         out = Dense(
-            2 * self.action_size, kernel_init=SMALL, bias_init=_head_bias(c.initial_std), name="action"
+            2 * self.action_size,
+            kernel_init=SMALL,
+            bias_init=_head_bias(c.initial_std, c.min_std),
+            name="action",
         )
         action = out(y)
         if foot is not None and c.leg_head:
@@ -291,5 +296,5 @@ def make_networks(
         value_network=FeedForwardNetwork(
             init=lambda key: critic.init(key, jnp.zeros((1, value_size))), apply=value_apply
         ),
-        parametric_action_distribution=RecurrentNormalTanh(event_size=action_size, min_std=MIN_STD),
+        parametric_action_distribution=RecurrentNormalTanh(event_size=action_size, min_std=config.min_std),
     )

@@ -292,7 +292,7 @@ def rescale_residuals(arrays: dict[str, np.ndarray], ratio: float) -> dict[str, 
 
 
 def rescale_spread(arrays: dict[str, np.ndarray], factor: float) -> dict[str, np.ndarray]:
-    """A policy's parameters with `factor` times the standard deviation of its actions before tanh.
+    """A policy's parameters with `factor` times the standard deviation of its actions before tanh, beyond the least.
 
     Where the policy's spread differs from state to state that holds as long as it is well below 1.
     """

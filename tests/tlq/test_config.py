@@ -102,8 +102,10 @@ def test_settings_that_an_older_run_does_not_name_are_as_they_were(tmp_path):
     settings.save_config(parse("terrain=poles", "run=r"), path)
     assert settings.load_config(path).policy.foothold_head > 0
     lines = path.read_text().splitlines(keepends=True)
-    path.write_text("".join(line for line in lines if "foothold_head" not in line))
-    assert settings.load_config(path).policy.foothold_head == 0
+    older = ("foothold_head", "min_std")
+    path.write_text("".join(line for line in lines if not any(name in line for name in older)))
+    policy = settings.load_config(path).policy
+    assert (policy.foothold_head, policy.min_std) == (0, 0.001)
 
 
 def test_resume_keeps_the_runs_settings_but_for_those_given(tmp_path):

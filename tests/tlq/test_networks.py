@@ -142,6 +142,10 @@ def test_an_untrained_policy_acts_little_and_explores_as_configured(heights):
     distribution = networks.parametric_action_distribution.create_dist(out)
     assert np.abs(distribution.loc).max() < 0.05
     np.testing.assert_allclose(distribution.scale, SMALL.initial_std, rtol=0.05)
+    # However small training makes the spread, some is left.
+    silent = dict(out, action=out["action"].at[:, ACTIONS:].set(-100.0))
+    scale = networks.parametric_action_distribution.create_dist(silent).scale
+    np.testing.assert_allclose(scale, SMALL.min_std, rtol=1e-6)
     value = networks.value_network.apply(statistics(obs), networks.value_network.init(KEY), obs)
     assert value.shape == (B,)
 
@@ -188,7 +192,10 @@ def test_footholds_take_over_a_share_of_the_residuals():
 
 def test_only_the_action_enters_the_density():
     networks = make_networks({"state": 110, "privileged_state": 20}, ACTIONS, config=SMALL)
-    mine, plain = networks.parametric_action_distribution, NormalTanhDistribution(ACTIONS)
+    mine, plain = (
+        networks.parametric_action_distribution,
+        NormalTanhDistribution(ACTIONS, min_std=SMALL.min_std),
+    )
     logits, carry = random(B, 2 * ACTIONS), random(B, 2 * W, seed=1)
     parameters = {"action": logits, "carry": carry}
     raw = mine.sample_no_postprocessing(parameters, KEY)
