@@ -111,6 +111,7 @@ class QuadrupedEnv(Env):
     def metric_names(self) -> tuple[str, ...]:
         """Names in `state.metrics`."""
         terms = ("along", "across", "smooth", "energy", "terrain", "aim", "height", "yaw", "heading", "tilt")
+        terms = (*terms, "knee") if self.config.rewards.knee else terms
         ends = ("ended", "distance", "length", "fell", "level", "exploded")
         kinds = (f"{part}/{kind}" for kind in self.mixture for part in ("share", "level"))
         return (
@@ -481,7 +482,11 @@ class QuadrupedEnv(Env):
             rise=jnp.maximum(jnp.max(around, axis=1) - after.lift_off, 0.0),
             drift=tg.frames.yaw(after.qpos[3:7]) - after.heading,
         )
-        return rewards.step_terms(c, step) | {"aim": jnp.mean(self._aim(after, around))}
+        terms = rewards.step_terms(c, step) | {"aim": jnp.mean(self._aim(after, around))}
+        if c.knee:
+            _, knees = self._clearance(after)
+            terms["knee"] = jnp.mean(rewards.knee(knees, c.knee_margin))
+        return terms
 
     def landing_points(self, episode: Episode) -> jax.Array:
         """Where the feet (L, 2) m in swing will come down, from the trunk's centre, heading frame: `Core`'s, exact."""
@@ -512,20 +517,25 @@ class QuadrupedEnv(Env):
     def _fell(self, episode: Episode, below: jax.Array, around: jax.Array) -> jax.Array:
         """Whether trunk or a knee hits the terrain, the trunk tilts too far, or a foot is in a gap."""
         c = self.config
-        rotation = tg.frames.rotation(episode.qpos[3:7])
-        trunk = self.robot.trunk_points @ rotation.T
-        knees = self._knees(episode) @ rotation.T
-        points = jnp.concatenate([trunk, knees]) + episode.qpos[:3]
-        ground = jnp.maximum(terrains.height(self.bank, episode.terrain, points[:, :2]), episode.floor)
-        radius = np.concatenate([np.zeros(len(self.robot.trunk_points)), np.full(4, c.knee_radius)])
-        hit = jnp.any(points[:, 2] - radius < ground)
-        fell = hit | (rotation[2, 2] < c.min_up)
+        trunk, knees = self._clearance(episode)
+        hit = jnp.any(trunk < 0) | jnp.any(knees < 0)
+        fell = hit | (tg.frames.rotation(episode.qpos[3:7])[2, 2] < c.min_up)
         if c.end_in_gap:
             top = jnp.max(around, axis=1)
             over_gap = top - around[:, 0] > c.rewards.gap_threshold
             low = below[:, 0] + around[:, 0] - self.robot.foot_radius < top - c.gap_depth
             fell |= jnp.any(over_gap & low)
         return fell
+
+    def _clearance(self, episode: Episode) -> tuple[jax.Array, jax.Array]:
+        """Heights above the terrain below them (m) of the trunk's points (N,), and of the knees (L,) less their radius."""
+        rotation = tg.frames.rotation(episode.qpos[3:7])
+        trunk = self.robot.trunk_points @ rotation.T
+        knees = self._knees(episode) @ rotation.T
+        points = jnp.concatenate([trunk, knees]) + episode.qpos[:3]
+        ground = jnp.maximum(terrains.height(self.bank, episode.terrain, points[:, :2]), episode.floor)
+        above = points[:, 2] - ground
+        return above[:-4], above[-4:] - self.config.knee_radius
 
     def _knees(self, episode: Episode) -> jax.Array:
         """Knees (L, 3) m in the trunk's frame."""

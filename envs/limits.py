@@ -80,6 +80,8 @@ LIMITS: dict[str, tuple[float, float]] = {
     "rewards.yaw": _WEIGHT,
     "rewards.heading": _WEIGHT,
     "rewards.tilt": _WEIGHT,
+    "rewards.knee": _WEIGHT,
+    "rewards.knee_margin": (1e-3, 1.0),
     "rewards.gap_threshold": (0.01, 5.0),
     "rewards.terrain_ring": (0.0, 0.1),
     "rewards.lift_threshold": (0.0, 1.0),

@@ -2,7 +2,7 @@
 
 from rewards.config import RewardConfig
 from rewards.step import Step, step_terms
-from rewards.terms import across, along, energy, height, smooth, standing, terrain
+from rewards.terms import across, along, energy, height, knee, smooth, standing, terrain
 from rewards.total import total
 
 __all__ = [
@@ -12,6 +12,7 @@ __all__ = [
     "along",
     "energy",
     "height",
+    "knee",
     "smooth",
     "standing",
     "step_terms",

@@ -33,6 +33,11 @@ class RewardConfig:
     alone leaves a slow drift, which adds up to radians over 5 m."""
     tilt: float = 0.2
     """Weight of the squared roll and pitch rates (s²/rad²), scaled by 0.1; not in the paper."""
+    knee: float = 0.0
+    """Weight of knees that come near the terrain (mean over the legs), -1 where one hits it; not in the paper. 0 leaves
+    the term away. On high stairs most falls are knees that hit the edge of the next step."""
+    knee_margin: float = 0.06
+    """Clearance of a knee below which that costs (m)."""
     literal: bool = False
     """The paper's own forms: r_v exponential, r_tau signed, all terms added. False: r_v linear below v_l, so that it
     pays for every bit of motion, and r_vo and r_smooth multiplied with it, so that standing earns nothing."""

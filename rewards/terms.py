@@ -97,6 +97,19 @@ def height(lift: jax.Array, rise: jax.Array, threshold: float) -> jax.Array:
     return -jnp.maximum(lift - rise - threshold, 0.0)
 
 
+def knee(clearance: jax.Array, margin: float) -> jax.Array:
+    """How near the knees come to the terrain: 0 from the margin on, -1 where they hit it.
+
+    Args:
+      clearance: (L,) m, from the terrain below a knee.
+      margin: m.
+
+    Returns:
+      (L,) in [-1, 0].
+    """
+    return -jnp.clip(1.0 - clearance / margin, 0.0, 1.0)
+
+
 def smooth(desired: jax.Array, previous: jax.Array) -> jax.Array:
     """r_smooth = exp(-½ ‖q_t - q_{t-1}‖²), on the desired joint angles (12,) rad."""
     return jnp.exp(-0.5 * jnp.sum(jnp.square(desired - previous)))

@@ -18,6 +18,7 @@ from tlq.cli import UsageError, unknown
 from tlq.files import whole
 from tlq.networks import BEFORE as BEFORE_NETWORKS
 from tlq.networks import NetworkConfig
+from tlq.ppo import BEFORE as BEFORE_PPO
 from tlq.ppo import PPOConfig
 
 _WIDTH = (1, 4096)
@@ -60,6 +61,7 @@ LIMITS: dict[str, tuple[float, float]] = {
     "ppo.guide": (0.0, 1e3),
     "ppo.guide_rate": (0.0, 1.0),
     "ppo.guide_epochs": (1, 1000),
+    "ppo.taken_over": (0.0, 1e3),
     "init_spread": (0.01, 100.0),
 }
 """Limits of the numbers outside of `env` (those have theirs in `envs.limits`), both ends included."""
@@ -395,7 +397,9 @@ def load_config(path: Path) -> TrainConfig:
         # Merged into the schema, which gives every value its type.
         schema = OmegaConf.structured(default_config())
         _writable(schema)
-        found = OmegaConf.merge({"env": {"tg": tg.BEFORE}, "policy": BEFORE_NETWORKS}, OmegaConf.load(path))
+        found = OmegaConf.merge(
+            {"env": {"tg": tg.BEFORE}, "policy": BEFORE_NETWORKS, "ppo": BEFORE_PPO}, OmegaConf.load(path)
+        )
         return build(TrainConfig, OmegaConf.to_container(OmegaConf.merge(schema, found)))
     except (
         OmegaConfBaseException,

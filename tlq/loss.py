@@ -76,7 +76,13 @@ def ppo_loss(
     if rollout.guide is not None and networks.footholds is None:
         mean = jnp.tanh(jnp.split(parameters["action"], 2, axis=-1)[0])
         guide_loss = jnp.mean(guide.cost(rollout.guide, mean))
-    total = policy_loss + value_loss + entropy_loss + config.guide * guide_loss
+    taken_over = jnp.float32(0)
+    if networks.footholds is not None:
+        squares = jnp.square(parameters["share"] * parameters["rest"])
+        taken_over = jnp.mean(jnp.sum(squares, axis=-1))
+    total = (
+        policy_loss + value_loss + entropy_loss + config.guide * guide_loss + config.taken_over * taken_over
+    )
 
     new = distribution.create_dist(parameters)
     kl = jnp.mean(new.kl_divergence(distribution.create_dist({"action": rollout.parameters})))
@@ -86,6 +92,7 @@ def ppo_loss(
         "value": value_loss,
         "entropy": entropy_loss,
         "guide": guide_loss,
+        "taken_over": taken_over,
         "kl": kl,
         "std": jnp.mean(new.scale),
         "std_max": jnp.max(new.scale),

@@ -157,10 +157,12 @@ class Footholds(nn.Module):
     config: NetworkConfig
 
     @nn.compact
-    def __call__(self, proprio: jax.Array, heights: jax.Array, rest: jax.Array) -> jax.Array:
+    def __call__(
+        self, proprio: jax.Array, heights: jax.Array, rest: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
         """Normalised proprio (.., S - 100), heights (.., 100), rest (.., 12): the rest's residual actions before tanh.
 
-        Returns what is to be added to those (.., 12).
+        Returns what is to be added to those (.., 12), and the shares g (.., 12).
         """
         c = self.config
         foot = _feet(c, heights)
@@ -169,7 +171,8 @@ class Footholds(nn.Module):
         context = nn.elu(Dense(c.foothold_head, name="proprio")(proprio))
         own, leg = _legs(c, c.foothold_head, pair, context)
         share = Dense(3, kernel_init=SMALL, bias_init=nn.initializers.constant(UNLED), name="share")(leg)
-        return nn.sigmoid(share.reshape(own.shape)) * (own - rest)
+        share = nn.sigmoid(share.reshape(own.shape))
+        return share * (own - rest), share
 
 
 class Policy(nn.Module):
@@ -186,7 +189,7 @@ class Policy(nn.Module):
         .. is (B,) for a step, (T, B) for a scan.
 
         Returns {'action': (.., 2 A), 'carry': (B, C) after the last step}, and with a part for footholds 'rest':
-        (.., 12), the residuals' means without it.
+        (.., 12), the residuals' means without it, and 'share': (.., 12), how much of them it takes over.
         """
         c = self.config
         x = nn.elu(Dense(c.encoder, name="proprio")(proprio))
@@ -212,8 +215,8 @@ class Policy(nn.Module):
         if heights is None or not c.foothold_head:
             return {"action": action, "carry": carry}
         rest = action[..., RESIDUALS]
-        action = action.at[..., RESIDUALS].add(Footholds(c, name="footholds")(proprio, heights, rest))
-        return {"action": action, "carry": carry, "rest": rest}
+        added, share = Footholds(c, name="footholds")(proprio, heights, rest)
+        return {"action": action.at[..., RESIDUALS].add(added), "carry": carry, "rest": rest, "share": share}
 
 
 class Critic(nn.Module):
@@ -288,7 +291,7 @@ def make_networks(
 
     def footholds_apply(statistics: Any, params: Any, state: jax.Array, rest: jax.Array) -> jax.Array:
         proprio, _ = split(_normalised(preprocess_observations_fn, statistics, {"state": state}, "state"))
-        return Footholds(config).apply({"params": params}, proprio, split(state)[1], rest)
+        return Footholds(config).apply({"params": params}, proprio, split(state)[1], rest)[0]
 
     return Networks(
         footholds=footholds_apply if heights and config.foothold_head else None,

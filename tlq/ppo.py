@@ -74,6 +74,13 @@ class PPOConfig:
     """Adam's learning rate of the part of the policy that leads feet to footholds."""
     guide_epochs: int = 2
     """Passes over the data of an iteration in which the guide teaches that part."""
+    taken_over: float = 0.03
+    """Weight in PPO's loss of the squares of the rest's residuals, before tanh, as far as that part takes them over.
+    They have no effect then and drift off, to where there is much to make up for whenever the share changes."""
+
+
+BEFORE = {"taken_over": 0.0}
+"""Settings that older runs don't name, as they were."""
 
 
 @flax.struct.dataclass
@@ -435,7 +442,7 @@ def _loss_metrics(losses: dict[str, jax.Array], minibatches: int) -> dict[str, j
     """Means over the gradient steps (each (epochs x minibatches,)); `kl_last` over the last pass."""
     figures = {
         f"loss/{n}": jnp.mean(losses[n])
-        for n in ("policy", "value", "entropy", "guide", "total", "grad_norm")
+        for n in ("policy", "value", "entropy", "guide", "taken_over", "total", "grad_norm")
     }
     figures |= {n: jnp.mean(losses[n]) for n in ("std", "std_max")}
     finite = jnp.isfinite(losses["total"]) & jnp.isfinite(losses["grad_norm"])

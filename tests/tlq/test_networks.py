@@ -184,6 +184,7 @@ def test_footholds_take_over_a_share_of_the_residuals():
     # Of whatever the rest does more, a share is taken back: it is replaced, not added to.
     share = added - networks.footholds(stats, own, obs["state"], both["rest"] + 1.0)
     assert ((share > 0) & (share < 1)).all()
+    np.testing.assert_allclose(both["share"], share, atol=1e-5)
     alone = dict(own, share=jax.tree.map(jnp.zeros_like, own["share"]) | {"bias": jnp.full(3, 100.0)})
     taken_over = [networks.footholds(stats, alone, obs["state"], r) + r for r in (both["rest"], 3.0)]
     np.testing.assert_allclose(*taken_over, atol=1e-5)

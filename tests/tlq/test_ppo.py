@@ -22,7 +22,7 @@ from tests.tlq.toy import ACTIONS, ToyEnv
 from tlq.loss import ppo_loss
 from tlq.memory import RecurrentWrapper, carry_size
 from tlq.networks import NetworkConfig, make_networks
-from tlq.ppo import AXIS, Learner, PPOConfig, adapt_learning_rate, hoist, make_mesh, summarise
+from tlq.ppo import AXIS, Learner, PPOConfig, Rollout, adapt_learning_rate, hoist, make_mesh, summarise
 
 NETWORKS = NetworkConfig(
     memory_width=16,
@@ -251,6 +251,35 @@ def test_the_guide_teaches_the_footholds_and_reward_the_rest():
     assert by_reward.pop("footholds") == 0 and min(by_reward.values()) > 0
     by_guide = changed(learning_rate=0.0, guide_rate=1e-3)
     assert by_guide.pop("footholds") > 5e-4 and max(by_guide.values()) == 0
+
+
+def test_residuals_that_footholds_take_over_cost_their_squares():
+    """The loss with the weight less that without: the squares of the rest's residuals times the shares, by hand."""
+    learner = make_learner(env=Asking(ToyEnv(length=5)), foothold_head=16)
+    state = learner.init(0)
+    params = jax.tree.map(lambda x: x + 0.1, state.params)
+    state = state.replace(params=params)
+    parts = learner.batch(state)
+    carry, last = parts["carry"], parts["last"]
+    observation = {name: parts[name] for name in ("state", "privileged_state", "is_first")}
+    names = ("action", "log_prob", "parameters", "reward", "done", "truncation")
+    rollout = Rollout(observation=observation, guide=None, rest=None, **{name: parts[name] for name in names})
+    keys = jax.random.split(jax.random.PRNGKey(0), B)
+
+    def loss(params, weight):
+        config = dataclasses.replace(CONFIG, taken_over=weight)
+        whole = functools.partial(ppo_loss, networks=learner.networks, config=config, axis=AXIS)
+        apart = jax.shard_map(whole, mesh=make_mesh(1), in_specs=P(), out_specs=P(), check_vma=False)
+        return apart(params, state.normaliser, rollout, carry, last, keys)[0]
+
+    networks = learner.networks
+    out = networks.policy_network.apply(state.normaliser, params.policy, dict(observation, carry=carry[None]))
+    expected = np.mean(np.sum(np.square(np.array(out["share"]) * np.array(out["rest"])), axis=-1))
+    assert expected > 1e-3
+    assert float(loss(params, 2.0) - loss(params, 0.0)) == pytest.approx(2.0 * expected, rel=1e-3)
+    # It teaches the rest, never the share.
+    grads = jax.grad(loss)(params, 2.0).policy["params"]
+    assert all(not leaf.any() for leaf in jax.tree.leaves(grads["footholds"]))
 
 
 def test_footholds_that_nobody_teaches_are_refused():
