@@ -110,7 +110,18 @@ class QuadrupedEnv(Env):
     @property
     def metric_names(self) -> tuple[str, ...]:
         """Names in `state.metrics`."""
-        terms = ("along", "across", "smooth", "energy", "terrain", "aim", "height", "yaw", "heading", "tilt")
+        terms: tuple[str, ...] = (
+            "along",
+            "across",
+            "smooth",
+            "energy",
+            "terrain",
+            "aim",
+            "height",
+            "yaw",
+            "heading",
+            "tilt",
+        )
         terms = (*terms, "knee") if self.config.rewards.knee else terms
         ends = ("ended", "distance", "length", "fell", "level", "exploded")
         kinds = (f"{part}/{kind}" for kind in self.mixture for part in ("share", "level"))
@@ -528,7 +539,7 @@ class QuadrupedEnv(Env):
         return fell
 
     def _clearance(self, episode: Episode) -> tuple[jax.Array, jax.Array]:
-        """Heights above the terrain below them (m) of the trunk's points (N,), and of the knees (L,) less their radius."""
+        """Heights (m) over the terrain of the trunk's points (N,), and of the knees (L,) less their radius."""
         rotation = tg.frames.rotation(episode.qpos[3:7])
         trunk = self.robot.trunk_points @ rotation.T
         knees = self._knees(episode) @ rotation.T

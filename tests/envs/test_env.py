@@ -290,6 +290,28 @@ def test_collisions_are_those_of_all_points_with_the_true_terrain(exact):
     assert 10 < sum(found) < len(found) - 10
 
 
+def test_knee_term_looks_at_the_knees_clearance(exact):
+    """By MuJoCo's knees over the true stairs; without a weight there is no such term."""
+    env, k, rng = exact.env, exact.find("stairs", 9), np.random.default_rng(0)
+    terrain, found = exact.terrain(k), []
+    c = dataclasses.replace(exact.config.rewards, knee=2.0)
+    paid = with_config(exact, dataclasses.replace(exact.config, rewards=c))
+    assert set(paid.metric_names) - set(env.metric_names) == {"reward/knee"}
+    for _ in range(6):
+        xy = rng.uniform(-1.4, 1.4, 2)
+        qpos = standing(env, xy=xy, joints=env.robot.default_pose + rng.normal(0, 0.3, 12))
+        qpos[2] = terrains.exact_height(terrain, xy) + rng.uniform(0.2, 0.3)
+        knees = exact.kinematics(qpos).xpos[env.robot.knee_ids]
+        ground = terrains.exact_height(terrain, cell_centres(env.bank, knees[:, :2]))
+        clear = knees[:, 2] - ground - exact.config.knee_radius
+        episode = episode_at(exact, k, qpos)
+        terms = paid._reward_terms(episode, episode, *paid._terrain_at_feet(episode))
+        found.append(np.mean(np.clip(1.0 - clear / c.knee_margin, 0.0, 1.0)))
+        assert terms["knee"] == pytest.approx(-found[-1], abs=0.02)  # heights are whole millimetres
+        assert rewards.total(c, terms)[1]["knee"] == pytest.approx(2.0 * terms["knee"])
+    assert np.std(found) > 0.1
+
+
 def with_config(subject, changed):
     return envs.QuadrupedEnv(changed, subject.env.bank)
 

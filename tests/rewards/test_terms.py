@@ -47,6 +47,11 @@ def test_along_as_the_paper_has_it(speed, expected):
     assert rewards.along(jnp.float32(speed), LOW, HIGH, literal=True) == pytest.approx(expected, abs=1e-6)
 
 
+def test_knee():
+    clearance = jnp.array([0.08, 0.06, 0.045, 0.0, -0.03])
+    np.testing.assert_allclose(rewards.knee(clearance, 0.06), [0.0, 0.0, -0.25, -1.0, -1.0], atol=1e-6)
+
+
 @pytest.mark.parametrize("literal", [False, True])
 def test_along_is_continuous_and_never_falls_up_to_the_highest_speed(literal):
     speed = jnp.linspace(-1.0, 1.5, 2501)
