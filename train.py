@@ -29,6 +29,9 @@ def run(node: DictConfig) -> None:
         cli.fail(error)
     except TrainingFailed as error:
         cli.fail(error, at_once=True)
+    except KeyboardInterrupt:  # once training goes on it is a request to save and stop
+        print("stopped", file=sys.stderr, flush=True)
+        sys.exit(130)
 
 
 if __name__ == "__main__":
