@@ -18,7 +18,6 @@ from tlq.cli import UsageError, unknown
 from tlq.files import whole
 from tlq.networks import BEFORE as BEFORE_NETWORKS
 from tlq.networks import NetworkConfig
-from tlq.ppo import BEFORE as BEFORE_PPO
 from tlq.ppo import PPOConfig
 
 _WIDTH = (1, 4096)
@@ -397,9 +396,7 @@ def load_config(path: Path) -> TrainConfig:
         # Merged into the schema, which gives every value its type.
         schema = OmegaConf.structured(default_config())
         _writable(schema)
-        found = OmegaConf.merge(
-            {"env": {"tg": tg.BEFORE}, "policy": BEFORE_NETWORKS, "ppo": BEFORE_PPO}, OmegaConf.load(path)
-        )
+        found = OmegaConf.merge({"env": {"tg": tg.BEFORE}, "policy": BEFORE_NETWORKS}, OmegaConf.load(path))
         return build(TrainConfig, OmegaConf.to_container(OmegaConf.merge(schema, found)))
     except (
         OmegaConfBaseException,

@@ -38,7 +38,7 @@ LEG_SIGN = np.array([[1, 1, 1], [-1, 1, 1]] * 2, np.float32)
 """(4, 3) turns a left leg's residuals (abduction, hip, knee) into the same leg's."""
 
 
-BEFORE = {"foothold_head": 0, "min_std": 0.001}
+BEFORE = {"foothold_head": 0}
 """Settings that older runs don't name, as they were."""
 
 
@@ -67,9 +67,9 @@ class NetworkConfig:
     """Hidden widths of the critic."""
     initial_std: float = 0.3
     """Standard deviation of the action, before tanh, of an untrained policy."""
-    min_std: float = 0.05
-    """Lower bound of that deviation, so that a policy goes on exploring. Without one, poles27 ended at 0.03 and stood
-    still (docs/experiments.md)."""
+    min_std: float = 0.001
+    """Lower bound of that deviation, so that a policy goes on exploring: poles27 ended at 0.03 and stood still. Whether
+    0.05 or so helps isn't known yet (docs/experiments.md)."""
     foothold_head: int = 64
     """Width of the layers of a network of its own that takes over the residuals where feet must be led to footholds.
     There is one where the terrain has pits and a scripted guide teaches it (`ppo.guide`). 0: none."""

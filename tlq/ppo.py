@@ -74,13 +74,10 @@ class PPOConfig:
     """Adam's learning rate of the part of the policy that leads feet to footholds."""
     guide_epochs: int = 2
     """Passes over the data of an iteration in which the guide teaches that part."""
-    taken_over: float = 0.03
+    taken_over: float = 0.0
     """Weight in PPO's loss of the squares of the rest's residuals, before tanh, as far as that part takes them over.
-    They have no effect then and drift off, to where there is much to make up for whenever the share changes."""
-
-
-BEFORE = {"taken_over": 0.0}
-"""Settings that older runs don't name, as they were."""
+    They have no effect then and drift off, to where there is much to make up for whenever the share changes. Whether
+    0.03 or so helps isn't known yet (docs/experiments.md)."""
 
 
 @flax.struct.dataclass

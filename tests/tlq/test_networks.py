@@ -143,9 +143,15 @@ def test_an_untrained_policy_acts_little_and_explores_as_configured(heights):
     assert np.abs(distribution.loc).max() < 0.05
     np.testing.assert_allclose(distribution.scale, SMALL.initial_std, rtol=0.05)
     # However small training makes the spread, some is left.
+    networks = make_networks(
+        {"state": 10 + heights, "privileged_state": 20},
+        ACTIONS,
+        config=dataclasses.replace(SMALL, min_std=0.05),
+        heights=heights,
+    )
     silent = dict(out, action=out["action"].at[:, ACTIONS:].set(-100.0))
     scale = networks.parametric_action_distribution.create_dist(silent).scale
-    np.testing.assert_allclose(scale, SMALL.min_std, rtol=1e-6)
+    np.testing.assert_allclose(scale, 0.05, rtol=1e-6)
     value = networks.value_network.apply(statistics(obs), networks.value_network.init(KEY), obs)
     assert value.shape == (B,)
 
