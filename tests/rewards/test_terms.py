@@ -153,6 +153,7 @@ WEIGHTS = {
     "yaw": 0.1,
     "heading": 0.3,
     "tilt": 0.2,
+    "knee": 2.0,
 }
 TERMS = {
     "along": 0.5,
@@ -165,6 +166,7 @@ TERMS = {
     "yaw": -0.3,
     "heading": -0.1,
     "tilt": -0.05,
+    "knee": -0.03,
 }
 
 
@@ -186,10 +188,11 @@ def test_total_by_hand():
         "yaw": -0.03,
         "heading": -0.03,
         "tilt": -0.01,
+        "knee": -0.06,
     }
     assert {name: float(value) for name, value in weighted.items()} == pytest.approx(expected, abs=1e-6)
-    # 0.5 + 0.2 + 0.075 - 0.1 - 0.1 - 0.05 - 0.04 - 0.03 - 0.03 - 0.01
-    assert reward == pytest.approx(0.415, abs=1e-6)
+    # 0.5 + 0.2 + 0.075 - 0.1 - 0.1 - 0.05 - 0.04 - 0.03 - 0.03 - 0.01 - 0.06
+    assert reward == pytest.approx(0.355, abs=1e-6)
 
 
 def test_literal_total_adds_the_gentle_terms_as_they_are():
@@ -214,7 +217,7 @@ def test_total_leaves_the_terms_alone():
 
 def test_every_weight_has_a_term():
     """A number in the configuration that no term uses would be a dead setting."""
-    thresholds = {"speed_low", "speed_high", "gap_threshold", "terrain_ring", "lift_threshold"}
+    thresholds = {"speed_low", "speed_high", "gap_threshold", "terrain_ring", "lift_threshold", "knee_margin"}
     switches = {"literal", "terrain_graded"}
     names = {field.name for field in dataclasses.fields(RewardConfig)}
     assert names - thresholds - switches == set(WEIGHTS)
