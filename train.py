@@ -30,8 +30,7 @@ def run(node: DictConfig) -> None:
     except TrainingFailed as error:
         cli.fail(error, at_once=True)
     except KeyboardInterrupt:  # once training goes on it is a request to save and stop
-        print("stopped", file=sys.stderr, flush=True)
-        sys.exit(130)
+        cli.stopped()
 
 
 if __name__ == "__main__":

@@ -110,7 +110,7 @@ class QuadrupedEnv(Env):
     @property
     def metric_names(self) -> tuple[str, ...]:
         """Names in `state.metrics`."""
-        terms: tuple[str, ...] = (
+        terms = (
             "along",
             "across",
             "smooth",
@@ -121,8 +121,8 @@ class QuadrupedEnv(Env):
             "yaw",
             "heading",
             "tilt",
+            *(("knee",) if self.config.rewards.knee else ()),
         )
-        terms = (*terms, "knee") if self.config.rewards.knee else terms
         ends = ("ended", "distance", "length", "fell", "level", "exploded")
         kinds = (f"{part}/{kind}" for kind in self.mixture for part in ("share", "level"))
         return (
@@ -191,28 +191,22 @@ class QuadrupedEnv(Env):
     def _by_kind(self) -> tuple[np.ndarray, np.ndarray]:
         """Instances (N + 1, levels, M) int32 of the bank by kind id and level of the ladder; how many (N + 1, levels).
 
-        Last the instances of any kind, which also stand in where the bank has none of a kind.
+        Last those of any kind, which also stand in where there is none of a kind on a level.
         """
         instance, kind = np.arange(self.bank.num_terrains), np.asarray(self.bank.kind_id)
-        any_kind = len(self.bank.kinds)
-        lists = [
-            [
-                np.flatnonzero((instance % self.levels == level) & ((kind == k) | (k == any_kind)))
-                for level in range(self.levels)
-            ]
-            for k in range(any_kind + 1)
-        ]
-        for level, found in enumerate(lists[any_kind]):
-            if len(found) == 0:  # a bank of fewer terrains than levels
-                lists[any_kind][level] = np.array([level % self.bank.num_terrains])
-        counts = np.array([[len(found) for found in row] for row in lists])
-        places = np.zeros((*counts.shape, counts.max()), np.int32)
-        for k, row in enumerate(lists):
-            for level, found in enumerate(row):
-                chosen = found if len(found) else lists[any_kind][level]
-                counts[k, level] = len(chosen)
-                places[k, level, : len(chosen)] = chosen
-        return places, counts
+
+        def fitting(k: int, level: int) -> np.ndarray:
+            same = instance % self.levels == level
+            # The last choice is for a bank of fewer terrains than levels.
+            choices = (same & (kind == k), same, instance == level % self.bank.num_terrains)
+            return next(np.flatnonzero(choice) for choice in choices if choice.any())
+
+        kinds = range(len(self.bank.kinds) + 1)  # no terrain's kind is the last number
+        lists = [[fitting(k, level) for level in range(self.levels)] for k in kinds]
+        counts = np.array([[len(found) for found in row] for row in lists], np.int32)
+        return np.array(
+            [[np.resize(found, counts.max()) for found in row] for row in lists], np.int32
+        ), counts
 
     def _draw_terrain(
         self, keys: list[jax.Array], level: jax.Array, like: jax.Array | None
@@ -223,11 +217,9 @@ class QuadrupedEnv(Env):
         level = jnp.where(jax.random.uniform(keys[1]) < c.revisit, lower, level)
         practised = jax.random.randint(keys[2], (), 0, self.levels)
         kind = len(self.bank.kinds) if like is None else self.bank.kind_id[like]
-        number = jax.random.uniform(keys[3])
 
         def place(level: jax.Array) -> jax.Array:
-            count = jnp.asarray(self._counts)[kind, level]
-            row = jnp.minimum((number * count).astype(jnp.int32), count - 1)
+            row = jax.random.randint(keys[3], (), 0, jnp.asarray(self._counts)[kind, level])
             return jnp.asarray(self._instances)[kind, level, row]
 
         pit = self.bank.floor[place(practised)] < -self.config.rewards.gap_threshold

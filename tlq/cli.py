@@ -130,8 +130,13 @@ def run(main: Callable[[Sequence[str]], None], arguments: Sequence[str] | None =
     except (ValueError, OSError) as error:
         fail(error)
     except KeyboardInterrupt:
-        print("stopped", file=sys.stderr, flush=True)
-        sys.exit(130)
+        stopped()
+
+
+def stopped() -> NoReturn:
+    """One line and exit code 130, for a program that was interrupted."""
+    print("stopped", file=sys.stderr, flush=True)
+    sys.exit(130)
 
 
 def fail(error: Exception, *, at_once: bool = False) -> NoReturn:
