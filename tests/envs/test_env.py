@@ -124,7 +124,9 @@ def test_nothing_of_an_episode_outlives_it(noisy):
         state = last_step(noisy, state, level=1 if i else 2).replace(
             info={**state.info, "level": jnp.int32(level)}
         )
-        state = state.replace(pipeline_state=state.pipeline_state.replace(key=key))
+        # The next terrain is of the same kind as the last.
+        terrain = walked.pipeline_state.terrain
+        state = state.replace(pipeline_state=state.pipeline_state.replace(key=key, terrain=terrain))
         ends.append(noisy.step(state, jnp.full(14, 0.5 * i)))
     for end in ends[1:]:
         assert end.done == 1.0
@@ -138,7 +140,7 @@ def test_the_new_episode_is_one_that_begins_with_the_same_key(noisy):
     end = noisy.step(last_step(noisy, walked), ZERO)
     # The key that follows the last step's, and the branch of it that resets use.
     key = jax.random.fold_in(jax.random.fold_in(walked.pipeline_state.key, 0), 3)
-    begun = noisy.begin(key, end.info["level"])
+    begun = noisy.begin(key, end.info["level"], walked.pipeline_state.terrain)
     for a, b in zip(leaves(end.pipeline_state), leaves(begun), strict=True):
         np.testing.assert_allclose(a, b, atol=1e-6)
     seen = noisy.observe(begun)
