@@ -14,6 +14,10 @@ A cell holds a height, its variance, and whether the height was *measured* or is
 and hit nothing in it, the ground lies below them. That is how a gap between poles shows, whose bottom is hardly ever
 seen. After Fankhauser et al., Robot-Centric Elevation Mapping with Uncertainty Estimates (CLAWAR 2014), whose map has
 no bounds.
+
+Where an edge is, single points don't tell: a range that is off by 2 cm puts a point beside it. So a cell counts the
+rays that meet its surface: those that end there, and those that go on deeper. Where a ray meets a surface doesn't
+depend on its range, only whether it ends there does.
 """
 
 import dataclasses
@@ -34,8 +38,8 @@ class ElevationConfig:
     gate: float = 3.0
     """A measurement agrees with a cell when it is within so many standard deviations of both together..."""
     least_gate: float = 0.02
-    """...or within this (m). One that doesn't takes the cell's place if it is higher, and rays that pass below do at
-    once: with a pose that drifts, what was seen last is nearest to the truth..."""
+    """...or within this (m). One that doesn't takes the cell's place if it is higher: with a pose that drifts, what was
+    seen last is nearest to the truth..."""
     doubt: float = 0.018
     """...but one that is lower may be the side of a step in the same cell: it adds the square of this (m) to the cell's
     variance..."""
@@ -60,6 +64,19 @@ class ElevationConfig:
     floor: float = 1 / 3
     """...and isn't floor: no more than this share of it and its neighbours, those that are measured, lie at its
     height."""
+    stop: float = 1.75
+    """A ray ends on a surface if its end lies within so many standard deviations above or below..."""
+    least_stop: float = 0.01
+    """...or within this (m)."""
+    reach: int = 1
+    """Where a cell isn't measured its surface, if it has one, is the highest within so many cells."""
+    solid: float = 0.65
+    """A cell is ground if at least this share of the rays that meet its surface end there. More than a half: a ray that
+    meets a gap near its far side ends on the wall, hardly below the edge..."""
+    trust: float = 1.0
+    """...and it is to begin with: so many rays are taken to have ended there."""
+    memory: float = 0.2
+    """Rays count for 1 / e after the robot has walked so far (m): the pose estimate drifts, and edges with it."""
     hole: float = 0.3
     """Depth (m) of a hole whose floor isn't seen. Deeper than what the policy tells apart, 0.25 m."""
 
@@ -82,6 +99,10 @@ class ElevationMap:
         """(N·N,) m², infinite where nothing is known."""
         self.bound = np.zeros(size, bool)
         """(N·N,) whether the height is only an upper bound."""
+        self.stopped = np.zeros(size)
+        """(N·N,) number of rays, old ones counted for less, that met the cell's surface and ended there..."""
+        self.went_on = np.zeros(size)
+        """(N·N,) ...and of those that ended deeper."""
         self.ground = 0.0
         """Height (m) where nothing is known near and far."""
         self.position = np.zeros(2)
@@ -118,6 +139,7 @@ class ElevationMap:
         """
         self.variance[:] = np.inf
         self.bound[:] = False
+        self.stopped[:] = self.went_on[:] = 0.0
         self.ground = ground
         self.position = np.array(position[:2], float)
         self.centre = self.cells_of(self.position)
@@ -135,15 +157,17 @@ class ElevationMap:
         n, centre = self.config.cells, self.cells_of(np.asarray(position[:2], float))
         way = float(np.hypot(*(position[:2] - self.position)))
         shift = centre - self.centre
-        grid, bound = self.variance.reshape(n, n), self.bound.reshape(n, n)
+        kept = ((self.variance, np.inf), (self.bound, False), (self.stopped, 0.0), (self.went_on, 0.0))
         for axis in range(2):
             count = min(abs(int(shift[axis])), n)
             first = self.centre[axis] + n // 2 if shift[axis] > 0 else centre[axis] - n // 2
             new = np.arange(first, first + count) % n
-            np.moveaxis(grid, axis, 0)[new] = np.inf
-            np.moveaxis(bound, axis, 0)[new] = False
+            for values, unknown in kept:
+                np.moveaxis(values.reshape(n, n), axis, 0)[new] = unknown
         self.centre, self.position = centre, np.array(position[:2], float)
         self.variance += way * self.config.drift**2
+        for count in (self.stopped, self.went_on):
+            count *= np.exp(-way / self.config.memory)
 
     def raise_by(self, change: float) -> None:
         """Moves everything up (m)."""
@@ -160,13 +184,27 @@ class ElevationMap:
         """
         if not len(points):
             return
-        where, measured, spread = self._tops(points, variance)
+        origin = np.broadcast_to(origin, points.shape)
+        where, measured, _ = self._tops(points, variance)
         self._follow(where, measured)
-        low = self._passes(np.broadcast_to(origin, points.shape), points)
+        surface = self._surface()
+        tolerance = np.maximum(self.config.stop * np.sqrt(variance), self.config.least_stop)
+        self._stop(origin, points, surface, tolerance)
+        low = self._passes(origin, points, surface, tolerance)
+        solid = self.solid()
+        where, measured, spread = self._tops(points, variance)
+        seen = solid[where] | self._floor(where, measured, surface[where])
+        where = where[seen]
         low[where] = np.inf  # what is seen in a cell counts for more than rays that miss it
-        self._measure(where, measured, spread)
+        self._measure(where, measured[seen], spread[seen])
         passed = np.flatnonzero(low < np.inf)
-        self._pass(passed, low[passed])
+        upper = self.height[passed] > surface[passed] - self.config.step
+        self._pass(passed, low[passed], upper & ~solid[passed], ~upper)
+
+    def solid(self) -> np.ndarray:
+        """Whether cells (N·N,) are ground, by the rays that met their surface."""
+        stopped = self.stopped + self.config.trust
+        return stopped >= self.config.solid * (stopped + self.went_on)
 
     def read(self, places: np.ndarray) -> np.ndarray:
         """Heights (...) m at places (..., 2) m: of the cell and those beside it that agree, or filled in from around
@@ -264,19 +302,71 @@ class ElevationMap:
         if known.sum() >= 20:
             self.raise_by(self.config.follow * float(np.median(deviation[known])))
 
-    def _passes(self, origin: np.ndarray, points: np.ndarray) -> np.ndarray:
-        """Heights (N·N,) m of the lowest ray over each cell, infinite where none passes, near the rays' ends only."""
+    def _surface(self) -> np.ndarray:
+        """Heights (N·N,) m at which cells are ground or not: the highest beside them, or their own if it is hardly
+        lower; -inf far from any.
+        """
+        measured = np.isfinite(self.variance) & ~self.bound
+        error = np.sqrt(np.where(measured, self.variance, 0.0))
+        surely = self._highest(np.where(measured, self.height - error, -np.inf), self.config.reach)
+        return np.where(measured & (self.height > surely - self.config.step), self.height, surely)
+
+    def _floor(self, where: np.ndarray, measured: np.ndarray, surface: np.ndarray) -> np.ndarray:
+        """Whether heights (C,) m measured in cells (C,) are of a floor below their surface (C,) m, rather than of a
+        wall: a little further from the edge something lies as low.
+        """
+        own = np.where(np.isfinite(self.variance) & ~self.bound, self.height, np.inf)
+        lowest = -self._highest(-own, self.config.reach + 1)[where]
+        return (measured <= surface - self.config.step) & (
+            np.abs(measured - lowest) <= self.config.least_gate
+        )
+
+    def _highest(self, heights: np.ndarray, reach: int) -> np.ndarray:
+        """Of heights (N·N,) the highest in the square that reaches so many cells to every side of each."""
+        n = self.config.cells
+        best = heights.reshape(n, n)
+        for axis in range(2):
+            best = np.max([np.roll(best, k, axis) for k in range(-reach, reach + 1)], axis=0)
+        return best.ravel()
+
+    def _stop(
+        self, origin: np.ndarray, points: np.ndarray, surface: np.ndarray, tolerance: np.ndarray
+    ) -> None:
+        """Counts in `stopped` the rays that end within a tolerance (M,) m of a surface, in the cells where they meet
+        it.
+        """
+        away = surface[self.index(self.cells_of(points))] - points[:, 2]
+        near = self.inside(self.cells_of(points)) & (np.abs(away) <= tolerance)
+        back = (origin - points)[near]
+        share = away[near] / np.maximum(back[:, 2], tolerance[near])
+        cells = self.cells_of(points[near, :2] + share[:, None] * back[:, :2])
+        met = self.index(cells[self.inside(cells)])
+        self.stopped += np.bincount(met, minlength=len(self.stopped))
+
+    def _passes(
+        self, origin: np.ndarray, points: np.ndarray, surface: np.ndarray, tolerance: np.ndarray
+    ) -> np.ndarray:
+        """Heights (N·N,) m of the lowest ray over each cell, infinite where none passes, near the rays' ends only.
+
+        Counts in `went_on` the rays that meet a cell's surface and end more than a tolerance (M,) m below it.
+        """
         c = self.config
         back = origin - points
         level = np.maximum(np.hypot(back[:, 0], back[:, 1]), 1e-9)
-        steps = np.arange(1, c.passes + 1) * c.cell
+        steps = np.arange(c.passes + 1) * c.cell
         share = steps / level[:, None]
         on = points[:, None] + share[..., None] * back[:, None]
         cells = self.cells_of(on)
-        own = (cells == self.cells_of(points)[:, None]).all(axis=-1)
-        keep = (share < 1.0) & self.inside(cells) & ~own
+        keep, where = (share < 1.0) & self.inside(cells), self.index(cells)
+        top, z = surface[where], on[..., 2]
+        half = 0.5 * c.cell * (back[:, 2] / level)[:, None]  # by how much rays sink over half a cell
+        before = (cells != cells[:, :1]).any(axis=-1)  # the cell of its end may be ground beyond it
+        meets = keep & (z - half < top) & (before | (top <= z + half))
+        meets &= points[:, 2, None] < top - tolerance[:, None]
+        self.went_on += np.bincount(where[meets], minlength=len(self.went_on))
+        keep &= before
         low = np.full(len(self.height), np.inf)
-        np.minimum.at(low, self.index(cells[keep]), on[keep][:, 2])
+        np.minimum.at(low, where[keep], z[keep])
         return low
 
     def _measure(self, where: np.ndarray, measured: np.ndarray, spread: np.ndarray) -> None:
@@ -297,13 +387,17 @@ class ElevationMap:
         self.variance[where] = np.where(keep, doubted, left)
         self.bound[where] = False
 
-    def _pass(self, where: np.ndarray, low: np.ndarray) -> None:
-        """Cells (C,) over which rays passed at heights (C,) m, and in which nothing was seen."""
+    def _pass(self, where: np.ndarray, low: np.ndarray, edge: np.ndarray, lower: np.ndarray) -> None:
+        """Cells (C,) over which rays passed at heights (C,) m, and in which nothing was seen.
+
+        edge: whether they turned out not to be ground at the height at which they lie; lower: whether they lie lower
+        than their surface.
+        """
         c = self.config
         height, variance, bound = self.height[where], self.variance[where], self.bound[where]
         new = np.isinf(variance)
         gate = np.maximum(c.gate * np.sqrt(np.where(new, 0.0, variance)), c.least_gate)
-        taken = new | (height - low > np.where(bound, 0.0, gate))
+        taken = new | np.where(bound, low < height, edge | lower & (height - low > gate))
         self.height[where] = np.where(taken, low, height)
         self.variance[where] = np.where(taken | bound, c.bound_deviation**2, variance)
         self.bound[where] = bound | taken

@@ -7,8 +7,10 @@ from hypothesis import strategies as st
 
 from tlq.elevation import ElevationConfig, ElevationMap
 
-PLAIN = ElevationConfig(cells=32, gate=1e3, least_deviation=1e-6, follow=0.0, drift=0.0)
-"""Every measurement agrees, and nothing else happens."""
+PLAIN = ElevationConfig(
+    cells=32, gate=1e3, least_deviation=1e-6, follow=0.0, drift=0.0, stop=0.0, least_stop=0.0, solid=0.0
+)
+"""Every measurement agrees, no cell is an edge, and nothing else happens."""
 
 
 def make(config=PLAIN, position=(0.0, 0.0), ground=0.0, **known):
@@ -217,6 +219,52 @@ def test_a_gap_is_deep_though_its_floor_is_never_seen():
     found = line(ground, np.array([0.1, 0.17, 0.23, 0.25, 0.27, 0.33, 0.4]))
     np.testing.assert_allclose(found[[0, 1, 5, 6]], 0.0, atol=2e-3)
     assert (found[2:5] < -0.25).all()
+
+
+@pytest.mark.parametrize(("width", "share"), [(0.06, 0.6), (0.1, 0.8)])
+def test_ranges_that_are_off_do_not_fill_a_gap(width, share):
+    """Off by 2 cm they put points into it from both sides, but rays that go on tell of it."""
+    ground, rng = make(ElevationConfig(cells=64)), np.random.default_rng(0)
+
+    def gap(x):
+        return np.where((x > 0.2) & (x < 0.2 + width), -0.5, 0.0)
+
+    for seed in range(8):
+        origin = np.array([0.0 if seed % 2 else 0.5, 0.0, 0.3])
+        points = scene(gap, origin, rays=1500, seed=seed)
+        ray = (points - origin) / np.linalg.norm(points - origin, axis=1)[:, None]
+        fuse(ground, points + 0.02 * rng.standard_normal((len(points), 1)) * ray, 0.02, origin)
+    y = 0.01 + 0.02 * np.arange(-8, 8)
+
+    def read(x):
+        return ground.read(np.stack(np.meshgrid(x, y), axis=-1))
+
+    assert (read(0.21 + np.arange(0.0, width, 0.02)) < -0.2).mean() > share
+    level = read(np.concatenate([0.17 - 0.02 * np.arange(5), 0.23 + width + 0.02 * np.arange(5)]))
+    assert (np.abs(level) < 0.02).mean() > 0.95
+
+
+def test_rays_that_stop_and_rays_that_go_on():
+    """A cell starts with one ray to its credit and is ground at 65 % or more."""
+    ground = make(ElevationConfig(cells=64, least_deviation=1e-6, follow=0.0))
+    origin = np.array([-0.49, 0.01, 0.5])
+    cell = ground.index(ground.cells_of(np.array([0.01, 0.01])))
+
+    def along(z):
+        """Where the ray from the origin that meets z = 0 in the middle of the cell comes to a height."""
+        return [0.01 - z, 0.01, z]
+
+    fuse(ground, along(0.0), 0.004, origin)  # nothing is known yet: it tells where the surface is
+    for z in (0.0, 0.006, -0.006):  # 1.75 x 4 mm is less than 1 cm, which counts
+        fuse(ground, along(z), 0.004, origin)
+    assert ground.stopped[cell] == 3 and ground.went_on[cell] == 0
+    for count in (1, 2):  # (1 + 3) / (1 + 3 + 2) = 0.67
+        fuse(ground, along(-0.1), 0.004, origin)
+        assert ground.went_on[cell] == count and not ground.bound[cell]
+    fuse(ground, along(-0.1), 0.004, origin)  # 4 / 7 = 0.57
+    assert ground.went_on[cell] == 3 and ground.bound[cell]
+    ground.move(np.array([0.2, 0.0]))
+    assert ground.stopped[cell] == pytest.approx(3 / np.e)
 
 
 def test_a_step_down_is_no_hole():
