@@ -58,8 +58,9 @@ class Stage:
         model = build_scene(sim.config.robot, sim.terrain, look=True)
         self._built = _add_terrain(self.scene, model, sim.terrain.floor)
         self._bodies = _add_robot(self.scene, model)
-        # The simulation's own model draws less, but has the same bodies.
-        assert sim.model.nbody == model.nbody
+        # The simulation's own model draws less, but has the same bodies and joints.
+        assert (sim.model.nbody, sim.model.nq) == (model.nbody, model.nq)
+        self._model, self._data = model, mujoco.MjData(model)
         self._focus = sim.data.qpos[:3].copy()
 
     def show(self, mark: str, visible: bool) -> None:
@@ -69,8 +70,11 @@ class Stage:
 
     def draw(self, sim: Simulation, direction: np.ndarray) -> None:
         """The present state; `direction` (2,) is the command."""
+        # The simulation's own places of bodies are a timestep old, and those of nothing at the start.
+        self._data.qpos[:] = sim.data.qpos
+        mujoco.mj_kinematics(self._model, self._data)
         for body, handle in self._bodies.items():
-            handle.position, handle.wxyz = sim.data.xpos[body], sim.data.xquat[body]
+            handle.position, handle.wxyz = self._data.xpos[body], self._data.xquat[body]
         self._move_view(sim.data.qpos[:3])
         self._draw_points(insight.sample_points(sim))
         self._draw_feet(insight.feet(sim), insight.desired_feet(sim))
