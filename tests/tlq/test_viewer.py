@@ -207,6 +207,7 @@ def test_a_visitor_leads_the_robot_over_poles(slowly, browser, tmp_path):
 def test_buttons(slowly, browser, file):
     with served(Session(file, "flat")) as (page, port):
         session = page.session
+        browser.set_window_size(*SMALL)
         browser.get(f"http://localhost:{port}")
         press(browser, "←")
         wait(lambda: session.direction @ np.array([0.0, 1.0]) > 0.99, "a command to the left")
