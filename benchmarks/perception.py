@@ -4,7 +4,7 @@
     python -m benchmarks.perception policy=blocks terrain=blocks sweep=none
 
 Distances are those of `tlq.evaluate`, in MuJoCo C, one source of error varied at a time and the others at their
-defaults (`tlq.perception.PerceptionConfig`). Errors of heights are taken while the policy walks by them. Then the three
+defaults (`tlq.senses.PerceptionConfig`). Errors of heights are taken while the policy walks by them. Then the three
 numbers of training's noise (`envs.RandomisationConfig`) are fitted to them.
 """
 
@@ -24,8 +24,8 @@ from tg.core import HEIGHT_CLIP
 from tlq import cli, evaluate
 from tlq.config import training_env
 from tlq.files import whole
-from tlq.perception import SENSORS, PerceptionConfig
 from tlq.runtime import Controller
+from tlq.senses import SENSORS, PerceptionConfig
 from tlq.simulation import Simulation
 
 VALUES = {

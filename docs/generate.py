@@ -18,6 +18,8 @@ from sphinx.pycode import ModuleAnalyzer
 from sphinx.util import logging
 from sphinx.util.docutils import SphinxDirective
 
+from tlq import cli
+
 logger = logging.getLogger(__name__)
 
 Row = tuple[str, ...]
@@ -73,7 +75,7 @@ def options(module: str) -> str:
     """A module's docstring, and a table of its `Options`."""
     found = importlib.import_module(module)
     rows = []
-    for field in dataclasses.fields(found.Options):
+    for field in cli.settings(found.Options):
         choices = field.metadata["choices"]
         text = field.metadata["text"] + (f"; one of {', '.join(choices())}" if choices else "")
         default = "required" if field.metadata["required"] else f"`{shown(field.default)}`"

@@ -29,6 +29,7 @@ ON_THE_ROBOT = (
     "tlq/deploy.py",
     "tlq/judge.py",
     "tlq/elevation.py",
+    "tlq/senses.py",
 )
 """What a robot needs of `tlq`: NumPy and `tg` alone, as soon as it is imported."""
 

@@ -36,6 +36,12 @@ def option(
     )
 
 
+def settings(cls: Any) -> list[Any]:
+    """Fields of an options class: its own, then those that it shares with other programs."""
+    own = cls.__dict__.get("__annotations__", {})
+    return sorted(dataclasses.fields(cls), key=lambda field: field.name not in own)
+
+
 def unknown(what: str, name: str, known: Sequence[str]) -> str:
     """A message that names the valid choices, and the closest one."""
     close = difflib.get_close_matches(name, known, n=1)
@@ -48,7 +54,7 @@ def parse(cls: Any, arguments: Sequence[str], text: str = "") -> Any:
     if {"--help", "-h"} & set(arguments):
         print(_help(cls, text))
         sys.exit(0)
-    fields = {field.name: field for field in dataclasses.fields(cls)}
+    fields = {field.name: field for field in settings(cls)}
     values: dict[str, Any] = {}
     for argument in arguments:
         key, equals, value = argument.partition("=")
@@ -84,7 +90,7 @@ def _convert(field: Any, value: str) -> Any:
 
 def _help(cls: Any, text: str) -> str:
     lines = [text.strip(), "", "settings (key=value):"]
-    for field in dataclasses.fields(cls):
+    for field in settings(cls):
         choices = field.metadata["choices"]
         names = f"; one of {', '.join(choices())}" if choices else ""
         default = "required" if field.metadata["required"] else f"default {field.default!r}"

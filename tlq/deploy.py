@@ -2,6 +2,7 @@
 
     python -m tlq.deploy policy=blocks terrain=blocks seconds=10 json=deploy.json   # both, in real time
     python -m tlq.deploy policy=blocks faults=0.2                                   # over a bad line
+    python -m tlq.deploy policy=blocks terrain=blocks perception=depth              # heights by simulated sensors
     python -m tlq.deploy role=policy policy=blocks address=127.0.0.1:7777           # the policy alone, for your robot
 
 The robot is MuJoCo C on the terrain's true geometry, its joints under PD control at 500 Hz. It sends its sensors every
@@ -30,6 +31,7 @@ from tlq.faults import BadLine
 from tlq.judge import GOAL
 from tlq.messages import LARGEST, MessageError, Sensing, Targets, unpack
 from tlq.runtime import Controller
+from tlq.senses import SensingOptions, check_use, described
 from tlq.supervisor import Mode, Supervisor
 
 ROLES = ("both", "policy")
@@ -48,7 +50,7 @@ def _terrains() -> Sequence[str]:
 
 
 @dataclasses.dataclass(frozen=True)
-class Options:
+class Options(SensingOptions):
     """What a user may set."""
 
     policy: str = option(
@@ -58,7 +60,9 @@ class Options:
     difficulty: str = option("paper", "number in [0, 1], or paper")
     seconds: float = option(10.0, "length of the run; role=policy: 0 for no end")
     direction: float = option(0.0, "of the walk, in degrees from straight ahead, left positive")
-    seed: int = option(0, "of the terrain (10,000 more than this) and of the faults")
+    seed: int = option(
+        0, "of the terrain (10,000 more than this), of the faults and of the perception's errors"
+    )
     faults: float = option(0.0, "share of the sensor messages that are lost, late, torn or nonsense")
     json: str = option("", "file to write the report to")
     role: str = option("both", "both: policy and simulated robot; policy: that alone", choices=lambda: ROLES)
@@ -192,8 +196,8 @@ class Robot:
         self.centres = np.full((4, 2), np.nan)
         self.sent = self.received = self.refused = self.newest = 0
         self.distance, self.fell = 0.0, False
-        self.periods, self.late, self.trips, self.waits = (
-            collections.deque[float](maxlen=_KEPT) for _ in range(4)
+        self.periods, self.late, self.trips, self.waits, self.looks = (
+            collections.deque[float](maxlen=_KEPT) for _ in range(5)
         )
 
     def run(self, seconds: float, check: Callable[[], None]) -> None:
@@ -227,6 +231,7 @@ class Robot:
             "pd_late_ms": spread(self.late),
             "round_trip_ms": spread(self.trips),
             "targets_period_ms": spread(self.waits),
+            "sensing_ms": spread(self.looks),
             "messages": {
                 "sent": self.sent,
                 "targets": self.received,
@@ -238,6 +243,7 @@ class Robot:
     def _sense(self) -> None:
         sim, now = self.sim, time.monotonic_ns()
         sim.look(self.centres)
+        self.looks.append(1e-9 * (time.monotonic_ns() - now))
         position = sim.data.qpos[:2] @ self.direction
         self.distance, self.fell = max(self.distance, float(position)), sim.fell()
         command = self.direction if self.distance < GOAL else 0.0 * self.direction
@@ -276,10 +282,12 @@ def _simulation(options: Options) -> Any:
     from tlq.evaluate import FIRST_SEED
     from tlq.simulation import Simulation
 
-    controller = Controller(find_policy(options.policy))
-    level = terrains.parse_difficulty(options.difficulty)
-    terrain = terrains.make_terrain(options.terrain, level, FIRST_SEED + options.seed)
-    return Simulation(controller, terrain, training_env(controller.metadata), timestep=PD_PERIOD)
+    controller, sensing = Controller(find_policy(options.policy)), options.sensing()
+    check_use(sensing, controller, options.policy)
+    config = training_env(controller.metadata)
+    level, seed = terrains.parse_difficulty(options.difficulty), FIRST_SEED + options.seed
+    terrain = terrains.make_terrain(options.terrain, level, seed)
+    return Simulation(controller, terrain, config, timestep=PD_PERIOD, perception=sensing, seed=seed)
 
 
 # -- both ------------------------------------------------------------------------------------------------------------
@@ -338,7 +346,7 @@ def _end(child: "subprocess.Popen[str]") -> None:
 
 def _asked(options: Options) -> dict[str, Any]:
     names = ("policy", "terrain", "difficulty", "direction", "seed", "faults")
-    return {name: getattr(options, name) for name in names}
+    return {name: getattr(options, name) for name in names} | {"perception": described(options.sensing())}
 
 
 # -- small things ----------------------------------------------------------------------------------------------------
@@ -385,6 +393,8 @@ def check(options: Options) -> None:
         raise ValueError(f"direction={options.direction} must be a finite number of degrees")
     if options.seed < 0:
         raise ValueError(f"seed={options.seed} must be 0 or more")
+    if options.sensing() is not None and options.role == "policy":
+        raise ValueError(f"perception={options.perception} needs role=both; role=policy has no robot")
     check_folders(options, "json")
 
 

@@ -224,6 +224,17 @@ class ElevationMap:
         found[missing] = self.ground
         return found.reshape(places.shape[:-1])
 
+    def measured(self, reach: float) -> np.ndarray:
+        """Centres and heights (C, 3) m of the cells within `reach` (m) of the robot in which something was seen."""
+        n = self.config.cells
+        line = np.arange(n) - n // 2
+        cells = self.centre + np.stack(np.meshgrid(line, line, indexing="ij"), axis=-1).reshape(-1, 2)
+        centres = (cells + 0.5) * self.config.cell
+        where = self.index(cells)
+        known = np.isfinite(self.variance[where]) & ~self.bound[where]
+        known &= np.hypot(*(centres - self.position).T) <= reach
+        return np.column_stack([centres, self.height[where]])[known]
+
     # -- parts of it
 
     def _seen(self, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

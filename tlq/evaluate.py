@@ -25,12 +25,10 @@ from tlq import judge
 from tlq.cli import check_folders, find_policy, option, parse, run
 from tlq.config import training_env
 from tlq.files import whole
-from tlq.perception import KINDS, PerceptionConfig
 from tlq.runtime import Controller, load_policy
+from tlq.senses import SensingOptions, check_use, described
 
 ENGINES = ("mjx", "mujoco")
-SENSING = ("drift", "latency", "missing", "range_noise")
-"""Options that range sensors alone have."""
 DIRECTIONS = (0.0, math.pi / 4, -math.pi / 4, -math.pi, -5 * math.pi / 4, -3 * math.pi / 4)
 """The paper's, rad; episode k takes number k % 6."""
 FIRST_SEED = 10_000
@@ -38,7 +36,7 @@ FIRST_SEED = 10_000
 
 
 @dataclasses.dataclass(frozen=True)
-class Options:
+class Options(SensingOptions):
     """What a user may set."""
 
     policy: str = option(
@@ -54,17 +52,6 @@ class Options:
     json: str = option("", "file to write the results to")
     noise: bool = option(False, "errors of sensors and map as in training")
     timestep: float = option(0.002, "of the physics (s); engine=mujoco only")
-    perception: str = option(
-        "map", "map: true heights; else range sensors, engine=mujoco only", choices=lambda: KINDS
-    )
-    drift: float = option(
-        PerceptionConfig.drift, "error of the pose estimate gained per metre walked (m); lidar and depth only"
-    )
-    latency: float = option(PerceptionConfig.latency, "of scans (s); lidar and depth only")
-    missing: float = option(PerceptionConfig.missing, "share of lost returns; lidar and depth only")
-    range_noise: float = option(
-        PerceptionConfig.range_noise, "multiple of the sensor's own noise; lidar and depth only"
-    )
     workers: int = option(1, "processes; engine=mujoco only")
 
 
@@ -78,11 +65,7 @@ def evaluate(options: Options, report: Callable[[str], None] = print) -> dict[st
     _check(options)
     path = find_policy(options.policy)
     policy = load_policy(path)
-    if options.perception != "map" and not policy.core.heights:
-        raise ValueError(
-            f"perception={options.perception} is of no use to policy={options.policy}, which is blind; "
-            "choose perception=map"
-        )
+    check_use(options.sensing(), policy, options.policy)
     walk = _walk_mujoco if options.engine == "mujoco" else _walk_mjx
     tallies = walk(options, path, policy.metadata, report)
     return summary(options, policy.metadata, tallies)
@@ -97,32 +80,11 @@ def _check(options: Options) -> None:
         raise ValueError(f"seed={options.seed} must be 0 or more")
     if not 0 < options.timestep <= 0.02:
         raise ValueError(f"timestep={options.timestep} must be in (0, 0.02]")
-    _check_perception(options)
-    check_folders(options, "json")
-
-
-def perception(options: Options) -> PerceptionConfig | None:
-    """What senses the ground; None: nothing does, heights are the map's."""
-    if options.perception == "map":
-        return None
-    return PerceptionConfig(kind=options.perception, **{name: getattr(options, name) for name in SENSING})
-
-
-def _check_perception(options: Options) -> None:
-    sensing = perception(options)
-    if sensing is None:
-        default = Options()
-        for name in SENSING:
-            if getattr(options, name) != getattr(default, name):
-                raise ValueError(
-                    f"{name}={getattr(options, name)} needs perception=lidar or perception=depth"
-                )
-        return
-    if options.engine != "mujoco":
+    if options.sensing() is not None and options.engine != "mujoco":
         raise ValueError(
             f"perception={options.perception} needs engine=mujoco; engine=mjx has no range sensors"
         )
-    sensing.check()
+    check_folders(options, "json")
 
 
 # -- engines ---------------------------------------------------------------------------------------------------------
@@ -195,7 +157,7 @@ def mujoco_episode(options: Options, path: Path, k: int) -> judge.Tally:
         config,
         timestep=options.timestep,
         noise=noise,
-        perception=perception(options),
+        perception=options.sensing(),
         seed=seed + k,
     )
     simulation.reset(start_phase(k))
@@ -229,7 +191,6 @@ def summary(options: Options, metadata: dict[str, Any], tallies: Sequence[judge.
     dt = metadata["control_dt"]
     runs = [_run(k, tally, dt) for k, tally in enumerate(tallies)]
     distance = np.array([r["distance_m"] for r in runs])
-    sensing = perception(options)
     swings, walked = sum(float(t.swings) for t in tallies), float(distance.sum())
     total = {name: sum(float(getattr(t, name)) for t in tallies) for name in ("work", "lift", "unsafe")}
     return {
@@ -240,7 +201,7 @@ def summary(options: Options, metadata: dict[str, Any], tallies: Sequence[judge.
         "episodes": len(runs),
         "seed": options.seed,
         "noise": options.noise,
-        "perception": {"kind": "map"} if sensing is None else dataclasses.asdict(sensing),
+        "perception": described(options.sensing()),
         "method": metadata["method"],
         "commit": metadata["commit"],
         "distance_m": {"mean": distance.mean(), "std": distance.std(), "min": distance.min()},

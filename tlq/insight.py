@@ -8,14 +8,20 @@ import numpy as np
 
 import rewards
 import tg
-from terrains import exact_height
 from tlq.simulation import Simulation
 
 
 def sample_points(sim: Simulation) -> np.ndarray:
-    """The terrain's points (L, P, 3) m that the policy sees."""
+    """The terrain's points (L, P, 3) m that the policy sees, as high as it sees them."""
     flat = sim.data.qpos[:2] + tg.frames.turn(np.asarray(sim.yaw), sim.points)
-    return np.concatenate([flat, exact_height(sim.terrain, flat)[..., None]], axis=-1)
+    return np.concatenate([flat, sim.data.qpos[2] + sim.heights[..., None]], axis=-1)
+
+
+def measured_cells(sim: Simulation, reach: float) -> np.ndarray:
+    """What the elevation map holds within `reach` (m) of the robot: centres and heights (C, 3) m of the cells that were
+    measured, from the robot's true place; none where heights are the terrain's own.
+    """
+    return np.zeros((0, 3)) if sim.perception is None else sim.perception.measured(sim.data, reach)
 
 
 def feet(sim: Simulation) -> np.ndarray:

@@ -3,51 +3,22 @@
 Letters: L = 4 legs (LF, RF, LR, RR), P = 25 sample points a foot. The estimate's frame is level, as the world's.
 """
 
-import dataclasses
 from collections import deque
 
 import mujoco
 import numpy as np
 
 import tg
-from tlq.elevation import ElevationConfig, ElevationMap
-from tlq.rangefinders import SENSORS, RangeSensors, in_frame
+from tlq.elevation import ElevationMap
+from tlq.rangefinders import RangeSensors, in_frame
+from tlq.senses import PerceptionConfig
 
-KINDS = ("map", *SENSORS)
-"""map: the terrain's true heights."""
 YAW_PER_METRE = 0.5
 """Assumed: the heading drifts by so many radians when the position drifts by a metre; 2 cm come with 0.6°."""
 LOOK_ROUND = 25
 """Control steps for which a standing robot looks round before it starts."""
 KNOWN = 0.1
 """The ground under the standing robot is known to so far (m) beyond its feet."""
-
-
-@dataclasses.dataclass(frozen=True)
-class PerceptionConfig:
-    """What senses the ground, and how badly."""
-
-    kind: str = "lidar"
-    """lidar or depth."""
-    drift: float = 0.02
-    """Standard deviation of the error that the pose estimate gains per metre walked, in x, in y and in z (m); a random
-    walk, so it grows with the root of the way."""
-    latency: float = 0.05
-    """Time from a scan to its place in the map (s); scans carry the time at which they were taken."""
-    missing: float = 0.05
-    """Share of the returns that are lost, at random."""
-    range_noise: float = 1.0
-    """Standard deviation of ranges, in multiples of the sensor's own."""
-    elevation: ElevationConfig = dataclasses.field(default_factory=ElevationConfig)
-    """The map."""
-
-    def check(self) -> None:
-        """Raises ValueError where a number is out of range."""
-        if self.kind not in SENSORS:
-            raise ValueError(f"unknown perception '{self.kind}'; choose one of {', '.join(SENSORS)}")
-        for name, most in (("drift", 1.0), ("latency", 1.0), ("missing", 1.0), ("range_noise", 20.0)):
-            if not 0 <= getattr(self, name) <= most:
-                raise ValueError(f"{name}={getattr(self, name)} must be in [0, {most:g}]")
 
 
 class PoseEstimate:
@@ -142,3 +113,11 @@ class Perception:
         yaw = tg.frames.yaw(data.qpos[3:7]) + self.pose.turned
         places = self.pose.position[:2] + tg.frames.turn(np.asarray(yaw), points)
         return self.ground.read(places) - self.pose.position[2]
+
+    def measured(self, data: mujoco.MjData, reach: float) -> np.ndarray:
+        """The map's measured cells (C, 3) m within `reach` (m), in the world: where they lie if the pose estimate is
+        taken to be right now.
+        """
+        away = self.ground.measured(reach) - self.pose.position
+        away[:, :2] = tg.frames.turn(np.asarray(-self.pose.turned), away[:, :2])
+        return data.qpos[:3] + away

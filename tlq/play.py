@@ -4,6 +4,7 @@
     python -m tlq.play policy=poles terrain=poles viewer=native   # MuJoCo's viewer; needs a display
     python -m tlq.play policy=poles terrain=poles video=walk.mp4  # a video; needs EGL or OSMesa
     python -m tlq.play policy=poles terrain=poles picture=walk.png  # a strip of moments
+    python -m tlq.play policy=poles terrain=poles perception=depth  # heights from simulated sensors
 
 The same kind, difficulty and seed give the same terrain as in `tlq.evaluate`.
 """
@@ -25,6 +26,7 @@ from tlq.config import training_env
 from tlq.evaluate import FIRST_SEED
 from tlq.judge import GOAL
 from tlq.runtime import Controller, load_policy
+from tlq.senses import SensingOptions, check_use
 from tlq.session import Session
 from tlq.simulation import Simulation
 
@@ -32,7 +34,7 @@ VIEWERS = ("browser", "native")
 
 
 @dataclasses.dataclass(frozen=True)
-class Options:
+class Options(SensingOptions):
     """What a user may set."""
 
     policy: str = option(
@@ -41,7 +43,7 @@ class Options:
     terrain: str = option("poles", "kind of terrain", choices=terrains.kinds)
     difficulty: str = option("paper", "number in [0, 1], or paper")
     direction: float = option(0.0, "of the walk, in degrees from straight ahead, left positive")
-    seed: int = option(0, "of the terrain (10,000 more than this)")
+    seed: int = option(0, "of the terrain (10,000 more than this) and of the perception's errors")
     seconds: float = option(12.0, "longest walk")
     video: str = option("", "MP4 file to write")
     picture: str = option("", "PNG file to write: a strip of moments")
@@ -66,11 +68,11 @@ class Walk:
 
 def simulation(options: Options) -> Simulation:
     """The robot on its terrain, ready to walk."""
-    path = find_policy(options.policy)
-    config = training_env(load_policy(path).metadata)
-    level = terrains.parse_difficulty(options.difficulty)
-    terrain = terrains.make_terrain(options.terrain, level, FIRST_SEED + options.seed)
-    return Simulation(Controller(path), terrain, config)
+    controller = Controller(find_policy(options.policy))
+    config = training_env(controller.metadata)
+    level, seed = terrains.parse_difficulty(options.difficulty), FIRST_SEED + options.seed
+    terrain = terrains.make_terrain(options.terrain, level, seed)
+    return Simulation(controller, terrain, config, perception=options.sensing(), seed=seed)
 
 
 def walk(sim: Simulation, direction: float, seconds: float) -> Walk:
@@ -108,7 +110,8 @@ def watch(sim: Simulation, direction: float) -> None:
 
 def browse(options: Options) -> None:
     """Serves a page on which the robot can be led about, until it is interrupted."""
-    session = Session(options.policy, options.terrain, options.difficulty, options.seed)
+    where = (options.terrain, options.difficulty, options.seed)
+    session = Session(options.policy, *where, perception=options.sensing())
     session.walk(math.radians(options.direction))
     viewer.serve(session, options.port)
 
@@ -166,7 +169,7 @@ def check(options: Options) -> None:
         if value and not value.endswith(ending):
             raise ValueError(f"{name}={value} must end in {ending}")
     check_folders(options, "video", "picture")
-    find_policy(options.policy)
+    check_use(options.sensing(), load_policy(find_policy(options.policy)), options.policy)
     if shown(options) and options.viewer == "browser":
         viewer.load_viser()
         viewer.check_port(options.port)

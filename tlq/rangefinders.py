@@ -13,8 +13,8 @@ import mujoco
 import numpy as np
 
 import tg
+from tlq.senses import SENSORS
 
-SENSORS = ("lidar", "depth")
 FARTHEST = 1.0
 """Rays end after so many metres: beyond, nothing is read from the map."""
 

@@ -22,6 +22,7 @@ from tlq.config import training_env
 from tlq.evaluate import FIRST_SEED
 from tlq.insight import RewardMeter
 from tlq.runtime import Controller, PolicyFileError
+from tlq.senses import PerceptionConfig, check_use
 from tlq.simulation import Simulation
 
 LATE = 0.1
@@ -75,7 +76,14 @@ def clip_path(name: str | Path) -> Path:
 class Session:
     """One robot on one terrain. Not for several threads at once. World frame, SI units."""
 
-    def __init__(self, policy: str, kind: str, difficulty: float | str = "paper", seed: int = 0):
+    def __init__(
+        self,
+        policy: str,
+        kind: str,
+        difficulty: float | str = "paper",
+        seed: int = 0,
+        perception: PerceptionConfig | None = None,
+    ):
         """Puts the robot on the terrain's start platform, told to stand.
 
         Args:
@@ -83,6 +91,7 @@ class Session:
           kind: of the terrain.
           difficulty: in [0, 1], or "paper".
           seed: of the terrain; evaluation's with the same number.
+          perception: range sensors and elevation map that give the heights; none: the terrain itself does.
         """
         self.path = find_policy(policy)
         self._stamp = _stamp(self.path)
@@ -96,10 +105,13 @@ class Session:
         """One line on what happened last."""
         self.kind, self.seed = kind, seed
         """What was asked for; `mixed` is one of the others in `sim.terrain`."""
+        self.perception = perception
+        """What senses the ground; None: heights are the terrain's."""
         self._owed = 0.0
         self._rows: list[tuple[np.ndarray, np.ndarray]] | None = None
         controller, config = read(self.path)
-        self._begin(Simulation(controller, make_terrain(kind, difficulty, seed), config))
+        check_use(perception, controller, self.path)
+        self._begin(controller, make_terrain(kind, difficulty, seed), config)
 
     # -- commands
 
@@ -127,9 +139,19 @@ class Session:
         """Another terrain; the robot starts anew."""
         self._check_not_recording()
         terrain = make_terrain(kind, difficulty, seed)
-        self._begin(Simulation(self.sim.controller, terrain, self.sim.config))
+        self._begin(self.sim.controller, terrain, self.sim.config)
         self.kind, self.seed = kind, seed
         self.news = f"on {terrain.kind}, difficulty {terrain.difficulty:g}, seed {seed}"
+
+    def sense(self, perception: PerceptionConfig | None) -> None:
+        """Heights from other sensors, or from the terrain itself; the robot starts anew."""
+        if perception is not None:
+            perception.check()
+        check_use(perception, self.sim.controller, self.path)
+        self._check_not_recording()
+        self.perception = perception
+        self._begin(self.sim.controller, self.sim.terrain, self.sim.config)
+        self.news = "heights from the map" if perception is None else f"heights from {perception.kind}"
 
     # -- time
 
@@ -185,7 +207,7 @@ class Session:
         """Goes on with another policy; raises ValueError, and keeps the present one, where that can't be run."""
         path = find_policy(policy)
         stamp = _stamp(path)
-        self._take_over(*read(path))
+        self._take_over(path, *read(path))
         self.path, self._stamp = path, stamp
         self.news = f"took over {path}"
 
@@ -198,7 +220,7 @@ class Session:
         if stamp is None or stamp == self._stamp:
             return False
         self._stamp = stamp
-        self._take_over(*read(self.path))
+        self._take_over(self.path, *read(self.path))
         self.news = f"took over a newer {self.path}"
         return True
 
@@ -225,9 +247,10 @@ class Session:
 
     # -- inside
 
-    def _begin(self, sim: Simulation) -> None:
-        self.sim = sim
-        self._meter = RewardMeter(sim)
+    def _begin(self, controller: Controller, terrain: Terrain, config: EnvConfig) -> None:
+        seed = terrain.seed  # as evaluation's first episode
+        self.sim = Simulation(controller, terrain, config, perception=self.perception, seed=seed)
+        self._meter = RewardMeter(self.sim)
         self._start_counting()
 
     def _start_counting(self) -> None:
@@ -241,7 +264,8 @@ class Session:
         self.news = f"{what} after {self.distance:.2f} m, {self.time:.1f} s; started anew"
         self.restart()
 
-    def _take_over(self, controller: Controller, config: EnvConfig) -> None:
+    def _take_over(self, path: Path, controller: Controller, config: EnvConfig) -> None:
+        check_use(self.perception, controller, path)
         old = self.sim.controller
         same = all(controller.metadata.get(key) == old.metadata.get(key) for key in _CONTROL)
         if same and config.robot == self.sim.config.robot:
@@ -251,7 +275,7 @@ class Session:
             return
         self._check_not_recording()
         try:
-            self._begin(Simulation(controller, self.sim.terrain, config))
+            self._begin(controller, self.sim.terrain, config)
         except KeyError as error:
             raise PolicyFileError(f"the policy's robot can't be built: {error}") from None
 

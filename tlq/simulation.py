@@ -13,8 +13,9 @@ from envs.robot import read_robot
 from envs.scene import build_scene
 from terrains import Terrain, exact_height
 from tlq.judge import Moment
-from tlq.perception import Perception, PerceptionConfig
+from tlq.perception import Perception
 from tlq.runtime import Controller
+from tlq.senses import PerceptionConfig
 
 
 class Simulation:

@@ -18,14 +18,20 @@ from tlq.simulation import Simulation
 
 HIGH, LOW = np.array([250, 205, 60]), np.array([40, 50, 130])
 """Colours of a sample point as high as the highest of the P x L, and of one `tg.core.HEIGHT_CLIP` or more below it."""
+MAP_HIGH, MAP_LOW = np.array([60, 220, 190]), np.array([110, 30, 130])
+"""Likewise of a cell of the elevation map, against the highest that is drawn."""
+MAP_REACH = 0.7
+"""The map is drawn up to this far (m) from the robot: at most 3,850 cells of 2 cm."""
 PATH_COLOUR, FOOT_COLOUR = (120, 120, 130), (255, 255, 255)
 DIMMED = 0.62
 """Of the ground's colours, which are meant for MuJoCo's light and would be white in viser's."""
 FOLLOWING = 0.15
 """Share of the way to the robot that the view makes with each picture."""
+OUT_OF_SIGHT = np.array([0.0, 0.0, -100.0])
+"""m."""
 JUMP = 1.0
 """A robot that is this far (m) away has started anew: the view goes there at once."""
-MARKS = ("sample points", "foot paths", "feet", "command")
+MARKS = ("sample points", "foot paths", "feet", "command", "elevation map")
 
 _BOX, _CYLINDER = int(mujoco.mjtGeom.mjGEOM_BOX), int(mujoco.mjtGeom.mjGEOM_CYLINDER)
 
@@ -52,8 +58,9 @@ class Stage:
         model = build_scene(sim.config.robot, sim.terrain, look=True)
         self._built = _add_terrain(self.scene, model, sim.terrain.floor)
         self._bodies = _add_robot(self.scene, model)
-        # The simulation's own model draws less, but has the same bodies.
-        assert sim.model.nbody == model.nbody
+        # The simulation's own model draws less, but has the same bodies and joints.
+        assert (sim.model.nbody, sim.model.nq) == (model.nbody, model.nq)
+        self._model, self._data = model, mujoco.MjData(model)
         self._focus = sim.data.qpos[:3].copy()
 
     def show(self, mark: str, visible: bool) -> None:
@@ -63,8 +70,11 @@ class Stage:
 
     def draw(self, sim: Simulation, direction: np.ndarray) -> None:
         """The present state; `direction` (2,) is the command."""
+        # The simulation's own places of bodies are a timestep old, and those of nothing at the start.
+        self._data.qpos[:] = sim.data.qpos
+        mujoco.mj_kinematics(self._model, self._data)
         for body, handle in self._bodies.items():
-            handle.position, handle.wxyz = sim.data.xpos[body], sim.data.xquat[body]
+            handle.position, handle.wxyz = self._data.xpos[body], self._data.xquat[body]
         self._move_view(sim.data.qpos[:3])
         self._draw_points(insight.sample_points(sim))
         self._draw_feet(insight.feet(sim), insight.desired_feet(sim))
@@ -72,7 +82,7 @@ class Stage:
         (arrow,) = self._marks["command"]
         start = sim.data.qpos[:3] + np.array([0.0, 0.0, 0.16])
         if not direction.any():  # an arrow out of sight: whether it is shown is the visitor's to say
-            start = start - np.array([0.0, 0.0, 100.0])
+            start = start + OUT_OF_SIGHT
         arrow.points = _f32([[start, start + 0.3 * np.append(direction, 0.0)]])
 
     def _move_view(self, trunk: np.ndarray) -> None:
@@ -85,10 +95,19 @@ class Stage:
     def _draw_points(self, points: np.ndarray) -> None:
         (cloud,) = self._marks["sample points"]
         points = points.reshape(-1, 3)
-        depth = np.clip((points[:, 2].max() - points[:, 2:]) / tg.core.HEIGHT_CLIP, 0.0, 1.0)
         # A little above the ground, which would hide half of them.
         cloud.points = _f32(points + np.array([0.0, 0.0, 0.004]))
-        cloud.colors = (HIGH + depth * (LOW - HIGH)).astype(np.uint8)
+        cloud.colors = _shaded(points, HIGH, LOW)
+
+    def draw_map(self, sim: Simulation) -> None:
+        """What the elevation map holds near the robot; nothing without one. Costs too much for every picture."""
+        (cloud,) = self._marks["elevation map"]
+        cells = insight.measured_cells(sim, MAP_REACH)
+        if len(cells) == 0:
+            cells = OUT_OF_SIGHT[None]
+        # Below the sample points, and a little above the ground.
+        cloud.points = _f32(cells + np.array([0.0, 0.0, 0.002]))
+        cloud.colors = _shaded(cells, MAP_HIGH, MAP_LOW)
 
     def _draw_feet(self, actual: np.ndarray, desired: np.ndarray) -> None:
         there, wanted, between = self._marks["feet"]
@@ -98,6 +117,12 @@ class Stage:
     def _draw_paths(self, paths: np.ndarray) -> None:
         (lines,) = self._marks["foot paths"]
         lines.points = _f32(np.stack([paths[:, :-1], paths[:, 1:]], axis=2).reshape(-1, 2, 3))
+
+
+def _shaded(points: np.ndarray, high: np.ndarray, low: np.ndarray) -> np.ndarray:
+    """Colours (N, 3) uint8 of points (N, 3) m, by how far each lies below the highest."""
+    depth = np.clip((points[:, 2].max() - points[:, 2:]) / tg.core.HEIGHT_CLIP, 0.0, 1.0)
+    return (high + depth * (low - high)).astype(np.uint8)
 
 
 def _f32(values: Any) -> np.ndarray:
@@ -131,7 +156,16 @@ def _add_marks(scene: Any) -> dict[str, tuple[Any, ...]]:
     )
     there = _balls(scene, "/world/feet", 0.012, np.array(FOOT_COLOUR, np.uint8))
     wanted = _balls(scene, "/world/desired", 0.018, colours)
-    groups = ((points,), (paths,), (there, wanted, between), (arrow,))
+    cells = scene.add_point_cloud(
+        "/world/map",
+        OUT_OF_SIGHT[None],
+        np.zeros((1, 3), np.uint8),
+        point_size=0.014,
+        point_shape="square",
+        precision="float32",
+        point_shading="flat",
+    )
+    groups = ((points,), (paths,), (there, wanted, between), (arrow,), (cells,))
     return dict(zip(MARKS, groups, strict=True))
 
 

@@ -20,12 +20,13 @@ import numpy as np
 
 import terrains
 from tlq.cli import one_line
+from tlq.senses import KINDS, MOST, PerceptionConfig
 from tlq.session import FASTEST_PUSH, Clip, Session, clip_path
 from tlq.stage import MARKS, Stage
 
 HOST = "127.0.0.1"
 FRAMES, READINGS, LOOKS = 1 / 25, 1 / 4, 1.0
-"""Seconds between pictures, between figures, and between looks at the policy's file."""
+"""Seconds between pictures, between figures, as of the elevation map, and between looks at the policy's file."""
 HISTORY = 10.0
 """Seconds that the plots show."""
 ARROWS = (
@@ -34,6 +35,13 @@ ARROWS = (
     {"↙": 135.0, "↓": 180.0, "↘": -135.0},
 )
 """Directions in degrees as the robot faces at the start, left positive."""
+ERRORS = {
+    "drift": "m per metre walked",
+    "latency": "s",
+    "missing": "share of the returns",
+    "range_noise": "multiple of the sensor's own",
+}
+"""What the numbers are that make range sensors worse."""
 PUSHES = {"←": 90.0, "↑": 0.0, "↓": 180.0, "→": -90.0}
 
 
@@ -90,7 +98,16 @@ class Page:
         self.gui.configure_theme(show_logo=False, show_share_button=False)
         self.gui.set_panel_label("tlq")
         self._news = self.gui.add_markdown("")
-        for part in (self._walking, self._time, self._push, self._terrain, self._policy, self._clip):
+        parts = (
+            self._walking,
+            self._time,
+            self._push,
+            self._terrain,
+            self._sensing,
+            self._policy,
+            self._clip,
+        )
+        for part in parts:
             part()
         self._marks()
         self._figures()
@@ -100,8 +117,8 @@ class Page:
     def run(self) -> None:
         """Simulates and draws until `end` is called."""
         last = time.monotonic()
-        due = dict.fromkeys((self._draw, self._read, self._look), last)
-        periods = dict(zip(due, (FRAMES, READINGS, LOOKS), strict=True))
+        due = dict.fromkeys((self._draw, self._draw_map, self._read, self._look), last)
+        periods = dict(zip(due, (FRAMES, READINGS, READINGS, LOOKS), strict=True))
         while not self._ended.is_set():
             now = time.monotonic()
             self._obey()
@@ -140,6 +157,10 @@ class Page:
                 self._drawn = sim
             self.stage.draw(sim, self.session.direction)
         self._remember()
+
+    def _draw_map(self) -> None:
+        if self._drawn is self.session.sim:
+            self.stage.draw_map(self.session.sim)
 
     def _look(self) -> None:
         self._try(self.session.refresh)
@@ -208,6 +229,26 @@ class Page:
         build.on_click(
             lambda _: self.order(lambda: self.session.build(kind.value, level.value, int(seed.value)))
         )
+
+    def _sensing(self) -> None:
+        now = self.session.perception or PerceptionConfig()
+        kind = "map" if self.session.perception is None else now.kind
+        with self.gui.add_folder("Heights from"):
+            self._sensor = self.gui.add_dropdown(
+                "sensor", KINDS, initial_value=kind, hint="map: true heights"
+            )
+            errors = {
+                name: self.gui.add_slider(name, 0.0, most, 0.01, getattr(now, name), hint=ERRORS[name])
+                for name, most in MOST.items()
+            }
+            use = self.gui.add_button("use")
+
+        @use.on_click
+        def _(_: Any) -> None:
+            chosen = {name: slider.value for name, slider in errors.items()}
+            kind = self._sensor.value
+            sensing = None if kind == "map" else PerceptionConfig(kind=kind, **chosen)
+            self.order(lambda: self.session.sense(sensing))
 
     def _policy(self) -> None:
         with self.gui.add_folder("Policy"):

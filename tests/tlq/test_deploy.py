@@ -97,6 +97,20 @@ def test_two_seconds_over_loopback(file, tmp_path, capsys):
     assert policy["period_ms"]["median"] > 10.0
 
 
+def test_a_second_by_depth_cameras(file, capsys):
+    deploy.main([f"policy={file}", "terrain=flat", "seconds=1", "perception=depth", "drift=0.05"])
+    report = json.loads(capsys.readouterr().out)
+    assert (report["perception"]["kind"], report["perception"]["drift"]) == ("depth", 0.05)
+    assert report["robot"]["messages"]["targets"] > 0 and report["robot"]["sensing_ms"]["median"] > 0
+    assert report["policy_process"]["faults"]["malformed"] == 0
+
+
+def test_a_blind_policy_needs_no_sensors(tmp_path):
+    blind = trained("blind", **SMALL).export(tmp_path / "policy.npz")
+    with pytest.raises(ValueError, match="perception=depth is of no use to .* which is blind"):
+        deploy.main([f"policy={blind}", "perception=depth"])
+
+
 def test_the_policys_process_answers_and_ends_with_its_parent(file):
     core, sensors = Controller(file).core, Controller(file).example_sensors()
     child = start("role=policy", f"policy={file}", "watch=true", stdin=subprocess.PIPE)
@@ -184,6 +198,9 @@ def test_the_policys_process_needs_neither_jax_nor_mujoco(file):
         ({"json": "/no/where/a.json"}, "there is no folder /no/where"),
         ({"policy": "nobody"}, "policy=nobody: no such policy"),
         ({"role": "robot"}, "unknown role 'robot' .*; choose one of both, policy"),
+        ({"latency": 0.2}, "latency=0.2 needs perception=lidar or perception=depth"),
+        ({"perception": "depth", "drift": -1}, r"drift=-1.0 must be in \[0, 1\]"),
+        ({"perception": "depth", "role": "policy"}, "perception=depth needs role=both; role=policy has no"),
         ({"role": "policy", "address": "here"}, "address=here isn't of the form host:port"),
     ],
 )

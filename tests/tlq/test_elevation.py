@@ -34,6 +34,19 @@ def centres(ground):
     return cells, (cells + 0.5) * ground.config.cell
 
 
+def test_cells_near_the_robot_in_which_something_was_seen():
+    ground = make(position=(5.0, -3.0))
+    ground.move(np.array([5.2, -3.0]))
+    points = np.array([[5.203, -2.999, 0.1], [5.311, -3.051, -0.2], [5.2, -2.7, 0.3]])
+    fuse(ground, points)
+    ground.bound[ground.index(ground.cells_of(np.array([5.1, -3.1])))] = True
+    ground.variance[ground.bound] = 0.01
+    # Cells of 2 cm: 5.20 to 5.22 and -3.00 to -2.98, 5.30 to 5.32 and -3.06 to -3.04; the third is 30 cm away.
+    found = ground.measured(0.2)
+    np.testing.assert_allclose(found[np.argsort(found[:, 0])], [[5.21, -2.99, 0.1], [5.31, -3.05, -0.2]])
+    assert len(ground.measured(0.35)) == 3 and ground.measured(0.0).shape == (0, 3)
+
+
 # -- fusion ----------------------------------------------------------------------------------------------------------
 
 

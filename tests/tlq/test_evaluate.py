@@ -329,6 +329,12 @@ def test_numbers_are_read_as_people_write_them():
     assert (options.episodes, options.seed, options.noise, options.timestep) == (100, 20000, True, 0.001)
 
 
+def test_settings_that_programs_share_come_last():
+    names = [field.name for field in cli.settings(evaluate.Options)]
+    assert names[:2] == ["policy", "terrain"]
+    assert names[-5:] == ["perception", "drift", "latency", "missing", "range_noise"]
+
+
 def test_policies_are_found_by_name(tmp_path, monkeypatch):
     monkeypatch.setattr(cli, "POLICIES", tmp_path)
     (tmp_path / "index.json").write_text('{"poles": {"file": "poles.npz"}, "stairs": {"file": "s.npz"}}')

@@ -13,9 +13,10 @@ from envs.scene import build_scene
 from tests.tlq.policies import trained
 from tlq import evaluate
 from tlq.config import training_env
-from tlq.perception import YAW_PER_METRE, PerceptionConfig, PoseEstimate
+from tlq.perception import YAW_PER_METRE, PoseEstimate
 from tlq.rangefinders import SENSORS, DepthConfig, LidarConfig, RangeSensors, in_frame
 from tlq.runtime import Controller
+from tlq.senses import PerceptionConfig
 from tlq.simulation import Simulation
 
 EXACT = {"drift": 0.0, "latency": 0.0, "missing": 0.0, "range_noise": 0.0}
@@ -251,6 +252,28 @@ def test_errors_are_those_of_the_seed(file):
 
     np.testing.assert_array_equal(heights(1), heights(1))
     assert np.abs(heights(1) - heights(2)).max() > 1e-4
+
+
+def test_measured_cells_lie_on_the_true_ground(file):
+    sim = simulation(file, "depth", "poles", 0.5)
+    cells = sim.perception.measured(sim.data, 0.5)
+    assert len(cells) > 500 and np.hypot(*(cells[:, :2] - sim.data.qpos[:2]).T).max() <= 0.5
+    clear = inside(sim.terrain, cells[:, :2]) > 0.02
+    true = terrains.exact_height(sim.terrain, cells[clear, :2])
+    assert np.quantile(np.abs(cells[clear, 2] - true), 0.95) < 0.005
+
+
+def test_a_wrong_heading_does_not_turn_what_the_robot_has_in_front(file):
+    """What the estimate has 0.4 m ahead and 0.1 m below the trunk is there in the world too, wherever it has itself."""
+    sim = simulation(file, "lidar")
+    perception, ground = sim.perception, sim.perception.ground
+    perception.pose.turned, perception.pose.position = 0.3, np.array([2.0, 1.0, 0.5])
+    ground.reset(perception.pose.position, 0.0)
+    point = perception.pose.position + [0.4 * np.cos(0.3), 0.4 * np.sin(0.3), -0.1]
+    ground.fuse(point + [0.0, 0.0, 1.0], point[None], np.array([1e-4]))
+    (cell,) = perception.measured(sim.data, 1.0)
+    # The centre of a cell of 2 cm: up to 1.4 cm off.
+    np.testing.assert_allclose(cell, sim.data.qpos[:3] + [0.4, 0.0, -0.1], atol=0.015)
 
 
 # -- evaluation and benchmark ----------------------------------------------------------------------------------------

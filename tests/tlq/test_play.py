@@ -35,6 +35,22 @@ def test_a_walk_is_recorded_step_by_step(file):
     assert record.distance == pytest.approx((record.qpos[:, 1] - start[1]).max(), abs=0.02)
 
 
+def test_a_walk_by_range_sensors(file):
+    options = play.Options(policy=str(file), terrain="flat", perception="depth", drift=0.0, range_noise=2.0)
+    sim = play.simulation(options)
+    sensing = sim.perception.config
+    assert (sensing.kind, sensing.drift, sensing.range_noise) == ("depth", 0.0, 2.0)
+    assert not play.walk(sim, 0.0, 0.2).fell
+    # Flat ground: 0 in the world, with the sensors' noise.
+    assert 0 < np.abs(sim.heights + sim.data.qpos[2]).max() < 0.03
+
+
+def test_a_blind_policy_needs_no_sensors(tmp_path):
+    blind = trained("blind").export(tmp_path / "policy.npz")
+    with pytest.raises(ValueError, match="perception=lidar is of no use to .* which is blind"):
+        play.main([f"policy={blind}", "terrain=flat", "perception=lidar", "video=walk.mp4"])
+
+
 def test_files_are_written(file, tmp_path, capsys):
     video, picture = tmp_path / "walk.mp4", tmp_path / "walk.png"
     try:
@@ -80,6 +96,9 @@ def test_a_page_that_cannot_be_served_is_said_before_anything_takes_long(file, m
         ({"viewer": "window"}, "unknown viewer 'window'; choose one of browser, native"),
         ({"port": 0}, r"port=0 must be in \[1, 65535\]"),
         ({"port": 65536}, r"port=65536 must be in \[1, 65535\]"),
+        ({"perception": "sonar"}, "unknown perception 'sonar'; choose one of map, lidar, depth"),
+        ({"drift": 0.1}, "drift=0.1 needs perception=lidar or perception=depth"),
+        ({"perception": "lidar", "missing": 2}, r"missing=2.0 must be in \[0, 1\]"),
         ({"policy": "nobody"}, "policy=nobody: no such policy"),
     ],
 )

@@ -11,6 +11,7 @@ import tg
 from tests.tlq.policies import trained
 from tlq import insight, session
 from tlq.render import RenderError
+from tlq.senses import PerceptionConfig
 from tlq.session import Session
 
 # A gait that stays up for a second or two without a policy.
@@ -198,6 +199,48 @@ def test_a_clip_is_written(flat, tmp_path):
     except RenderError as error:  # no OpenGL here
         pytest.skip(str(error))
     assert written.stat().st_size > 1000
+
+
+# -- range sensors
+
+
+def test_heights_from_other_sensors(flat, tmp_path):
+    flat.walk(0.0)
+    run(flat, 5)
+    true = flat.sim.heights
+    assert len(insight.measured_cells(flat.sim, 1.0)) == 0
+    flat.record()
+    with pytest.raises(ValueError, match="a clip is being recorded"):
+        flat.sense(PerceptionConfig())
+    flat.take_clip()
+    flat.sense(PerceptionConfig(kind="depth", drift=0.0))
+    assert flat.time == 0 and flat.news == "heights from depth" and flat.direction[0] == 1
+    run(flat, 5)
+    assert 0 < np.abs(flat.sim.heights - true).max() < 0.03
+    # The ground is flat: the map has it at 0, and so have the points that are drawn.
+    cells, points = insight.measured_cells(flat.sim, 0.5), insight.sample_points(flat.sim)
+    assert len(cells) > 500 and abs(np.median(cells[:, 2])) < 0.005 and np.abs(points[..., 2]).max() < 0.03
+    with pytest.raises(ValueError, match=r"missing=2 must be in \[0, 1\]"):
+        flat.sense(PerceptionConfig(missing=2))
+    flat.build("blocks", 0.2, 0)
+    assert flat.sim.perception.config.kind == "depth"
+    flat.sense(None)
+    assert flat.sim.perception is None
+
+
+def test_a_blind_policy_takes_no_sensors(flat, tmp_path):
+    blind = trained("blind", spread=0.0, **SMALL).export(tmp_path / "policy.npz")
+    message = "perception=lidar is of no use to policy=.*policy.npz, which is blind; choose perception=map"
+    with pytest.raises(ValueError, match=message):
+        Session(str(blind), "flat", perception=PerceptionConfig())
+    flat.sense(PerceptionConfig())
+    with pytest.raises(ValueError, match=message):
+        flat.load(str(blind))
+    flat.sense(None)
+    flat.load(str(blind))
+    with pytest.raises(ValueError, match=message):
+        flat.sense(PerceptionConfig())
+    assert flat.sim.perception is None and flat.path == blind
 
 
 # -- what is shown
