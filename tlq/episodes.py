@@ -160,7 +160,7 @@ def load(file: str | os.PathLike[str], setting: Setting) -> list[Episode]:
         raise ValueError(
             f"recording={file} is of another policy, terrain, difficulty or seed; choose another file"
         )
-    return [Episode(*part, bool(f)) for part, f in zip(parts, fell, strict=True)]
+    return [Episode(a, b, c, bool(f)) for (a, b, c), f in zip(parts, fell, strict=True)]
 
 
 def _key(setting: Setting) -> np.ndarray:

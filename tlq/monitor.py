@@ -186,7 +186,7 @@ def _metadata(array: np.ndarray) -> dict[str, Any]:
     if found.get("version") != VERSION:
         raise MonitorFileError(f"format version {found.get('version')}; this program reads version {VERSION}")
     for name, most in (("stop", 1.0), ("go", 1.0), ("resume", 60.0), ("horizon", 60.0)):
-        value = found.get(name)
+        value: Any = found.get(name)
         if type(value) not in (int, float) or not 0.0 <= value <= most:
             raise MonitorFileError(f"metadata: {name} must be a number in [0, {most:g}]")
     if found["go"] > found["stop"]:

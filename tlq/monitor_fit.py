@@ -299,12 +299,17 @@ def stretches(episode: Episode) -> list[tuple[int, int, bool]]:
 
 
 def choose(network: Network, part: Sequence[Episode], options: Options, dt: float) -> float:
-    """The lowest threshold with no more false alarms per 10 m than may be, on these episodes; else the highest."""
-    for stop in THRESHOLDS:
+    """The lowest threshold down to which there are no more false alarms per 10 m than may be, on these episodes.
+
+    Sought from above: far below, where there is always an alarm, there is only one.
+    """
+    chosen = THRESHOLDS[-1]
+    for stop in THRESHOLDS[::-1]:
         found = alarms(network, part, Decision(stop, 0.5 * stop, 1.0), options.horizon, dt)
-        if found["false_alarms_per_10_m"] <= options.false_alarms:
-            return float(stop)
-    return float(THRESHOLDS[-1])
+        if found["false_alarms_per_10_m"] > options.false_alarms:
+            break
+        chosen = stop
+    return float(chosen)
 
 
 def trade(network: Network, part: Sequence[Episode], options: Options, dt: float) -> list[dict[str, Any]]:

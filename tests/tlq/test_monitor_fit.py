@@ -80,7 +80,8 @@ def test_the_threshold_is_the_lowest_with_few_false_alarms():
     options = monitor_fit.Options(policy="x", out="y", horizon=0.4, false_alarms=1.0)
     noisy = episode(np.tile([-3.0] * 30 + [0.4], 20))  # a peak of 0.6 every 3.1 m
     found = monitor_fit.choose(PLAIN, [noisy], options, 0.1)
-    assert 0.55 < found <= 0.625  # the next of the thresholds beyond 0.6
+    # sigmoid(0.4) = 0.599. Below 0.047 a single alarm would last for good: few alarms, but no choice.
+    assert found == 0.6
     assert monitor_fit.choose(PLAIN, [noisy], dataclasses.replace(options, false_alarms=9), 0.1) == 0.02
 
 
@@ -98,7 +99,8 @@ def test_a_fit_finds_what_foretells_falls():
     x, y = monitor_fit.shown(network, part[45:], 10)
     assert calibration.auc(x, y) > 0.95
     found = monitor_fit.measure(network, part[45:], 10)
-    assert found["brier"]["high"] < found["brier_of_base_rate"]["low"] and found["brier_skill"]["value"] > 0.5
+    assert found["brier"]["value"] < 0.6 * found["brier_of_base_rate"]["value"]
+    assert found["brier_skill"]["low"] > 0
     assert sum(row["steps"] for row in found["reliability"]) == found["steps"] == len(y)
 
 
