@@ -251,11 +251,11 @@ def _watched(simulation: Any, monitor: Monitor, tally: judge.Tally, origin: np.n
     """Episode k, from its start on, with a monitor."""
     controller, stood, alarm, highest = simulation.controller, 0.0, None, 0.0
     while tally.ended == judge.RUNNING:
-        told = (0.0 if monitor.standing else 1.0) * direction(k)
         stood += controller.control_dt * monitor.standing
-        moment = simulation.step(told)
+        moment = simulation.hold() if monitor.standing else simulation.step(direction(k))
         tally = judge.update(tally, moment, origin, direction(k), controller.control_dt)
-        if monitor.step(controller) and alarm is None:
+        monitor.step(controller)
+        if monitor.decision.alarms and alarm is None:
             alarm = float(tally.progress)
         highest = max(highest, monitor.last)
         if stood >= STOOD and not monitor.decision.resume and tally.ended == judge.RUNNING:

@@ -2,10 +2,10 @@
 
     controller = Controller("policy.npz")
     monitor = Monitor("monitor.npz", "policy.npz")
-    stand = False
     while True:                                           # every `control_dt` seconds
-        q_des = controller.step(sensors, heights, [0.0, 0.0] if stand else command)
-        stand = monitor.step(controller)
+        if not monitor.standing:                          # else the joints keep the last q_des
+            q_des = controller.step(sensors, heights, command)
+        monitor.step(controller)
 
 `python -m tlq.monitor_fit` makes the file. Letters: S observed values, M of memory, F = S + M + 14 features.
 """
@@ -110,7 +110,11 @@ class Decision:
 
 
 class Monitor:
-    """Watches one controller, and says when it is to stand."""
+    """Watches one controller, and says when the joints are to be held as they are.
+
+    After an alarm that is from the next touch-down on, when all feet are on the ground. (A command of 0 would fade the
+    gait out wherever in its cycle it is, and drag the feet below the hips.)
+    """
 
     def __init__(self, path: str | os.PathLike[str], policy: str | os.PathLike[str]):
         """Reads a monitor's file; raises MonitorFileError if it can't be used with the policy's file."""
@@ -128,11 +132,9 @@ class Monitor:
         self.decision.reset()
         self.last = 0.0
         """The last probability."""
-
-    @property
-    def standing(self) -> bool:
-        """Whether the robot is to stand."""
-        return self.decision.standing
+        self.standing = False
+        """Whether the joints are to be held, and the controller isn't to be stepped."""
+        self._swing: bool | None = None  # whether LF was in swing
 
     def probability(self, controller: Controller) -> float:
         """That the robot falls within `metadata["horizon"]` seconds, if it goes on; after `controller.step`."""
@@ -140,9 +142,17 @@ class Monitor:
         return 0.5 + 0.5 * math.tanh(0.5 * float(logit(self.network, x)))
 
     def step(self, controller: Controller) -> bool:
-        """One control period, after `controller.step`: whether to command standing in the next one."""
+        """One control period, after `controller.step` if there was one: whether to hold the joints in the next one."""
+        if self.standing:  # nothing new was seen; time goes by
+            self.standing = self.decision.step(0.0, controller.control_dt)
+            return self.standing
         self.last = self.probability(controller)
-        return self.decision.step(self.last, controller.control_dt)
+        alarmed = self.decision.step(self.last, controller.control_dt)
+        swing = bool(controller.state.phase > 0)
+        landed = swing != self._swing or not controller.state.gate > 0
+        self._swing = swing
+        self.standing = alarmed and landed
+        return self.standing
 
 
 # -- the file --------------------------------------------------------------------------------------------------------

@@ -261,12 +261,12 @@ def alarms(
     window, lead, false, walked = round(2.0 * horizon / dt), [], 0, 0.0
     falls, kept, whole_way = 0, 0.0, 0.0
     for episode in part:
-        x = logit(network, episode.features.astype(np.float32))
+        p = calibration.sigmoid(logit(network, episode.features.astype(np.float32))).tolist()
         for first, end, fell in stretches(episode):
             decision.reset()
             starts, before = [], False
             for t in range(first, end):
-                now = decision.step(float(calibration.sigmoid(x[t])), dt)
+                now = decision.step(p[t], dt)
                 if now and not before:
                     starts.append(t)
                 before = now

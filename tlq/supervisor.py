@@ -36,7 +36,7 @@ class Mode(enum.IntEnum):
     STAND = 4
     """Messages are missing: the controller is told to stand, and fades the gait out."""
     STOP = 5
-    """The monitor foresees a fall: the controller is told to stand, on the newest message."""
+    """The monitor foresees a fall: the joints are held as they are."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -77,7 +77,7 @@ class Supervisor:
     ):
         """Takes a controller, which nobody else may step, the limits, and what may stop it.
 
-        A stop for good by the monitor ends when the messages command standing.
+        A stop for good by the monitor ends when the messages command standing, and then walking.
         """
         self.controller, self.config, self.monitor = controller, config or SupervisorConfig(), monitor
         self.mode = Mode.WAIT
@@ -88,6 +88,7 @@ class Supervisor:
         self.stops = 0
         """How often the monitor had the robot stand."""
         self._heard = -math.inf  # when it was accepted
+        self._told = False  # to stand, since the monitor stopped the robot
         self._standing = np.asarray(controller.core.standing_target, float)
         self._desired = self._standing
 
@@ -178,21 +179,31 @@ class Supervisor:
                 self._release()
                 self.mode = Mode.WALK
         elif fresh:
-            if not self.last.command.any():
-                self._release()
-            if self.monitor is not None and self.monitor.standing:
+            if self._stopped(self.last):
                 self.stops += self.mode is not Mode.STOP
                 self.mode = Mode.STOP
                 return
-            if self.mode in (Mode.STAND, Mode.STOP) and not self.controller.state.gate > 0:
+            if self.mode is Mode.STAND and not self.controller.state.gate > 0:
                 self._start_again()
             self.mode = Mode.WALK
         else:  # half a period more: calls don't come at exact times
             held = silence <= c.grace + 0.5 * self.controller.control_dt
             self.mode = Mode.HOLD if held else Mode.STAND
 
+    def _stopped(self, message: Sensing) -> bool:
+        """Whether the monitor stops the robot; not after standing was commanded, and then walking."""
+        if self.monitor is None or not self.monitor.standing:
+            self._told = False
+            return False
+        if self._told and message.command.any():
+            self._release()
+            return False
+        self._told |= not message.command.any()
+        return True
+
     def _release(self) -> None:
         """Nothing that the monitor said before counts any more."""
+        self._told = False
         if self.monitor is not None:
             self.monitor.reset()
 
@@ -204,14 +215,15 @@ class Supervisor:
 
     def _wanted(self, message: Sensing) -> np.ndarray:
         """Desired joint angles (12,) rad, before the limit of their change."""
+        if self.mode is not Mode.POSE and self.monitor is not None and self.monitor.standing:
+            self.monitor.step(self.controller)
+            return np.asarray(self.controller.state.desired, float)
         if self.mode is not Mode.POSE:
             sensors, command = message.sensors, message.command
             if self.mode is Mode.STAND:
                 # The old speeds say nothing of now; the gyro's would be summed up into a turn that wasn't.
                 still = {name: 0.0 * sensors[name] for name in ("angular_velocity", "joint_velocity")}
                 sensors, command = sensors | still, 0.0 * command
-            if self.monitor is not None and self.monitor.standing:
-                command = 0.0 * command
             heights = message.heights if self.controller.core.heights else None
             desired = np.asarray(self.controller.step(sensors, heights, command), float)
             if self.monitor is not None:

@@ -188,6 +188,15 @@ def test_a_monitor_that_always_alarms_leads_to_standing(policy, tmp_path):
     assert watched.tally.progress < 0.2  # walking, it gets 1.2 m far in this time
 
 
+def test_the_robot_goes_on_after_a_while(policy, tmp_path):
+    watch = Monitor(made(tmp_path / "m.npz", policy, bias=NEVER, resume=0.5), policy)
+    controller = Controller(policy)
+    watch.decision.step(1.0, 0.02)
+    controller.step(controller.example_sensors(), np.full((4, 25), -0.3), FORWARD)
+    # 0.5 s are 25 control periods, the last of which says that the robot goes on.
+    assert [watch.step(controller) for _ in range(25)] == 24 * [True] + [False]
+
+
 def test_results_tell_of_the_monitor(policy, tmp_path, capsys):
     file, out = made(tmp_path / "m.npz", policy, bias=ALWAYS), tmp_path / "result.json"
     arguments = [f"policy={policy}", "terrain=flat", "engine=mujoco", "episodes=1", f"json={out}"]
@@ -217,27 +226,30 @@ class Watched(Rig):
 
 def test_the_supervisor_stands_while_the_monitor_says_so(policy, tmp_path):
     rig = Watched(policy, made(tmp_path / "m.npz", policy, bias=ALWAYS))
-    for _ in range(30):
+    for _ in range(5):
         rig.step()
-    controller = rig.supervisor.controller
-    assert rig.mode is Mode.STOP and rig.supervisor.stops == 1
-    assert controller.state.gate == 0 and not controller.state.stride.any()
-    rig.step(None)  # without a message it doesn't walk either
-    assert rig.mode is Mode.HOLD and not controller.state.stride.any()
+    held = rig.last
+    for _ in range(30):
+        np.testing.assert_array_equal(rig.step(), held)
+        assert rig.mode is Mode.STOP
+    assert rig.supervisor.stops == 1
+    np.testing.assert_array_equal(rig.step(None), held)  # without a message it doesn't walk either
+    assert rig.mode is Mode.HOLD
 
 
 def test_commanding_standing_ends_a_stop(policy, tmp_path):
     rig = Watched(policy, made(tmp_path / "m.npz", policy, bias=NEVER))
     rig.walk()
-    decision = rig.supervisor.monitor.decision
+    controller, decision = rig.supervisor.controller, rig.supervisor.monitor.decision
     decision.step(1.0, 0.02)
-    for _ in range(20):
+    swing = controller.state.phase > 0
+    for _ in range(20):  # more than half a cycle: to the touch-down
         rig.step()
-        assert rig.mode is Mode.STOP
+    assert rig.mode is Mode.STOP and (controller.state.phase > 0) != swing
     rig.step(rig.message(command=STILL))
-    assert rig.mode is Mode.WALK and not decision.standing
+    assert rig.mode is Mode.STOP
     rig.walk()
-    assert rig.supervisor.stops == 1 and rig.supervisor.controller.state.gate == 1
+    assert rig.supervisor.stops == 1 and not decision.standing
 
 
 def test_a_supervisor_with_a_silent_monitor_is_one_without(policy, tmp_path):
@@ -245,3 +257,17 @@ def test_a_supervisor_with_a_silent_monitor_is_one_without(policy, tmp_path):
     for k in range(60):
         first, second = (rig.step(None if 20 < k < 26 else "good") for rig in rigs)
         np.testing.assert_array_equal(first, second)
+
+
+@pytest.mark.parametrize("name", sorted(path.stem for path in (cli.POLICIES / "monitors").glob("*.npz")))
+def test_monitors_that_come_with_tlq_belong_to_their_policies(name):
+    """After another policy took the name: `python -m tlq.monitor_fit`, as in docs/safety.md."""
+    metadata = Monitor(cli.find_monitor(name), cli.find_policy(name)).metadata
+    results = json.loads((cli.POLICIES / "results" / f"{name}_monitor.json").read_text())
+    assert {k: v for k, v in metadata.items() if k in results} == {
+        k: v for k, v in results.items() if k in metadata
+    }
+    assert (
+        metadata["policy"] == name
+        and metadata["command"] in (cli.POLICIES.parent / "docs/safety.md").read_text()
+    )
