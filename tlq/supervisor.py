@@ -4,7 +4,7 @@
     desired = supervisor.step(message or None, now)     # every control period; (12,) rad
 
 Every message is judged before it is used. While good ones come, the controller walks, unless a `tlq.monitor` foresees a
-fall: then it is told to stand. Without one, it goes on with the last good state for `grace`, then is told to stand, and
+fall: then the joints are held. Without one, it goes on with the last good state for `grace`, then is told to stand, and
 after `stand` more the joints are led slowly to the standing pose. It has no clock and no sockets: `now` is given, so
 that it can be tested in no time.
 """
