@@ -23,6 +23,7 @@ ON_THE_ROBOT = (
     "tlq/runtime.py",
     "tlq/graph.py",
     "tlq/messages.py",
+    "tlq/monitor.py",
     "tlq/supervisor.py",
     "tlq/faults.py",
     "tlq/cli.py",

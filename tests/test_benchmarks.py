@@ -50,6 +50,27 @@ def test_footholds(tmp_path):
     assert 0 < found["landing_error_1_m"] < found["landing_error_8_m"] < 0.2
 
 
+def test_monitor_compares_pair_by_pair():
+    from benchmarks import monitor
+    from tlq import judge
+    from tlq.evaluate import Walk
+
+    def walk(ended, progress, alarms=0):
+        tally = judge.Tally(*[0.0] * len(judge.Tally._fields))._replace(ended=ended, progress=progress)
+        return Walk(tally, alarms, None, 3.0 * alarms, 0.5)
+
+    fell, stuck, reached = judge.FELL, judge.STUCK, judge.REACHED
+    base = [walk(fell, 2.0), walk(fell, 1.0), walk(fell, 4.0), walk(reached, 5.02), walk(reached, 5.0)]
+    watched = [walk(stuck, 1.5, 1), walk(fell, 0.9, 1), base[2], walk(fell, 2.6, 1), base[4]]
+    found = monitor.compare(base, watched)
+    assert (found["falls_without"], found["falls_with"]) == (3, 3)
+    assert (found["prevented"], found["caused"], found["falls_without_alarm"]) == (1, 1, 1)
+    # 2 + 1 + 4 + 5 + 5 = 17 m without, 1.5 + 0.9 + 4 + 2.6 + 5 = 14 m with.
+    assert found["distance_lost"] == pytest.approx(3 / 17)
+    assert found["falls_per_10_m_with"] == pytest.approx(30 / 14)
+    assert (found["alarms"], found["stood_s"], found["reached_with"]) == (3, 9.0, 1)
+
+
 @pytest.mark.slow
 def test_perception(tmp_path):
     picture = tmp_path / "curves.png"

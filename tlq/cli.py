@@ -115,6 +115,21 @@ def find_policy(name: str) -> Path:
     )
 
 
+def find_monitor(name: str) -> Path | None:
+    """Path of a safety monitor: a file's, or that of one that comes with tlq, by its name; None for "none"."""
+    if name == "none":
+        return None
+    path = Path(name)
+    if path.is_file():
+        return path
+    shipped = {file.stem: file for file in sorted((POLICIES / "monitors").glob("*.npz"))}
+    if name in shipped:
+        return shipped[name]
+    raise UsageError(
+        f"monitor={name}: no such monitor; choose a monitor's file, or one of {', '.join(['none', *shipped])}"
+    )
+
+
 def check_folders(options: Any, *names: str) -> None:
     """Raises UsageError where the folder of a file that is to be written isn't there."""
     for name in names:

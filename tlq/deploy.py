@@ -26,10 +26,11 @@ from typing import Any, NoReturn
 
 import numpy as np
 
-from tlq.cli import check_folders, find_policy, option, parse, run
+from tlq.cli import check_folders, find_monitor, find_policy, option, parse, run
 from tlq.faults import BadLine
 from tlq.judge import GOAL
 from tlq.messages import LARGEST, MessageError, Sensing, Targets, unpack
+from tlq.monitor import Monitor
 from tlq.runtime import Controller
 from tlq.senses import SensingOptions, check_use, described
 from tlq.supervisor import Mode, Supervisor
@@ -64,6 +65,7 @@ class Options(SensingOptions):
         0, "of the terrain (10,000 more than this), of the faults and of the perception's errors"
     )
     faults: float = option(0.0, "share of the sensor messages that are lost, late, torn or nonsense")
+    monitor: str = option("none", "file of a safety monitor, or name of one that comes with tlq")
     json: str = option("", "file to write the report to")
     role: str = option("both", "both: policy and simulated robot; policy: that alone", choices=lambda: ROLES)
     address: str = option("127.0.0.1:0", "role=policy: where it listens, host:port; port 0: any free one")
@@ -76,9 +78,11 @@ class Options(SensingOptions):
 class PolicyServer:
     """Answers a robot's sensor messages, at the rate of the control periods."""
 
-    def __init__(self, path: str, address: tuple[str, int], watch: bool = False):
+    def __init__(
+        self, path: str, address: tuple[str, int], watch: bool = False, monitor: Monitor | None = None
+    ):
         """Loads a policy and listens; with `watch` it ends when standard input is closed."""
-        self.supervisor = Supervisor(Controller(path))
+        self.supervisor = Supervisor(Controller(path), monitor=monitor)
         self.dt = self.supervisor.controller.control_dt
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.socket.bind(address)
@@ -113,6 +117,7 @@ class PolicyServer:
             "step_ms": spread(self.works),
             "modes": dict(self.modes),
             "faults": dict(self.supervisor.faults) | {"malformed": self.malformed},
+            "stops_by_monitor": self.supervisor.stops,
         }
 
     def _tick(self, message: Sensing | None, now: float) -> None:
@@ -170,13 +175,19 @@ class PolicyServer:
 
 def serve(options: Options) -> None:
     """The policy's process: one line of JSON with its address at the start, one with its report at the end."""
-    server = PolicyServer(str(find_policy(options.policy)), _address(options.address), options.watch)
+    path, address = find_policy(options.policy), _address(options.address)
+    server = PolicyServer(str(path), address, options.watch, _monitor(options))
     print(json.dumps({"address": server.socket.getsockname()}), flush=True)
     try:
         server.run(options.seconds)
     except KeyboardInterrupt:
         pass
     print(json.dumps(server.report()), flush=True)
+
+
+def _monitor(options: Options) -> Monitor | None:
+    file = find_monitor(options.monitor)
+    return None if file is None else Monitor(file, find_policy(options.policy))
 
 
 # -- the robot's process ---------------------------------------------------------------------------------------------
@@ -295,8 +306,11 @@ def _simulation(options: Options) -> Any:
 
 def deploy(options: Options) -> dict[str, Any]:
     """Starts the policy's process, is the robot, and ends the other process whatever happens."""
+    _monitor(options)  # refuses a bad file before anything is started
     sim = _simulation(options)
     arguments = ["role=policy", f"policy={find_policy(options.policy)}", "watch=true"]
+    monitor = find_monitor(options.monitor)
+    arguments.append(f"monitor={monitor.absolute() if monitor else 'none'}")
     arguments.append(f"seconds={options.seconds + START_LIMIT}")
     child = subprocess.Popen(
         [sys.executable, "-m", "tlq.deploy", *arguments],
@@ -345,7 +359,7 @@ def _end(child: "subprocess.Popen[str]") -> None:
 
 
 def _asked(options: Options) -> dict[str, Any]:
-    names = ("policy", "terrain", "difficulty", "direction", "seed", "faults")
+    names = ("policy", "terrain", "difficulty", "direction", "seed", "faults", "monitor")
     return {name: getattr(options, name) for name in names} | {"perception": described(options.sensing())}
 
 

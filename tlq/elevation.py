@@ -166,8 +166,8 @@ class ElevationMap:
                 np.moveaxis(values.reshape(n, n), axis, 0)[new] = unknown
         self.centre, self.position = centre, np.array(position[:2], float)
         self.variance += way * self.config.drift**2
-        for count in (self.stopped, self.went_on):
-            count *= np.exp(-way / self.config.memory)
+        self.stopped *= np.exp(-way / self.config.memory)
+        self.went_on *= np.exp(-way / self.config.memory)
 
     def raise_by(self, change: float) -> None:
         """Moves everything up (m)."""

@@ -15,16 +15,17 @@ import os
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 import envs
 import terrains
 from tlq import judge
-from tlq.cli import check_folders, find_policy, option, parse, run
+from tlq.cli import check_folders, find_monitor, find_policy, option, parse, run
 from tlq.config import training_env
 from tlq.files import whole
+from tlq.monitor import Monitor
 from tlq.runtime import Controller, load_policy
 from tlq.senses import SensingOptions, check_use, described
 
@@ -33,6 +34,8 @@ DIRECTIONS = (0.0, math.pi / 4, -math.pi / 4, -math.pi, -5 * math.pi / 4, -3 * m
 """The paper's, rad; episode k takes number k % 6."""
 FIRST_SEED = 10_000
 """Training's terrains have seeds below."""
+STOOD = 3.0
+"""An episode ends when a monitor has stopped the robot for good and it has stood for so long (s)."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,6 +55,9 @@ class Options(SensingOptions):
     json: str = option("", "file to write the results to")
     noise: bool = option(False, "errors of sensors and map as in training")
     timestep: float = option(0.002, "of the physics (s); engine=mujoco only")
+    monitor: str = option(
+        "none", "file of a safety monitor, or name of one that comes with tlq; engine=mujoco only"
+    )
     workers: int = option(1, "processes; engine=mujoco only")
 
 
@@ -66,9 +72,14 @@ def evaluate(options: Options, report: Callable[[str], None] = print) -> dict[st
     path = find_policy(options.policy)
     policy = load_policy(path)
     check_use(options.sensing(), policy, options.policy)
-    walk = _walk_mujoco if options.engine == "mujoco" else _walk_mjx
-    tallies = walk(options, path, policy.metadata, report)
-    return summary(options, policy.metadata, tallies)
+    if options.engine == "mjx":
+        return summary(options, policy.metadata, _walk_mjx(options, path, policy.metadata, report))
+    monitor = find_monitor(options.monitor)
+    if monitor is not None:
+        Monitor(monitor, path)  # refuses a bad file before anything takes long
+    walks = _walk_mujoco(options, path, policy.metadata, report)
+    tallies = [walk.tally for walk in walks]
+    return summary(options, policy.metadata, tallies, walks if monitor is not None else None)
 
 
 def _check(options: Options) -> None:
@@ -80,6 +91,8 @@ def _check(options: Options) -> None:
         raise ValueError(f"seed={options.seed} must be 0 or more")
     if not 0 < options.timestep <= 0.02:
         raise ValueError(f"timestep={options.timestep} must be in (0, 0.02]")
+    if options.monitor != "none" and options.engine != "mujoco":
+        raise ValueError(f"monitor={options.monitor} needs engine=mujoco; engine=mjx has no monitor")
     if options.sensing() is not None and options.engine != "mujoco":
         raise ValueError(
             f"perception={options.perception} needs engine=mujoco; engine=mjx has no range sensors"
@@ -122,28 +135,50 @@ def _walk_mjx(options: Options, path: Path, metadata: dict[str, Any], report: An
     return [judge.Tally(*(leaf[k] for leaf in found)) for k in range(count)]
 
 
-def _walk_mujoco(options: Options, path: Path, metadata: dict[str, Any], report: Any) -> list[judge.Tally]:
-    tallies: list[Any] = [None] * options.episodes
+class Walk(NamedTuple):
+    """One episode in MuJoCo C."""
 
-    def done(k: int, tally: judge.Tally) -> None:
-        tallies[k] = tally
-        ended = sum(t is not None for t in tallies)
-        report(f"episode {k}: {describe(tally, metadata['control_dt'])} ({ended} of {options.episodes})")
+    tally: judge.Tally
+    """What it came to."""
+    alarms: int
+    """Of the monitor."""
+    alarm_m: float | None
+    """Progress at the first alarm (m); None if there was none."""
+    stood: float
+    """Time for which the monitor had the robot stand (s)."""
+    highest: float
+    """The largest probability that the monitor gave."""
+
+
+def _walk_mujoco(options: Options, path: Path, metadata: dict[str, Any], report: Any) -> list[Walk]:
+    walks: list[Any] = [None] * options.episodes
+
+    def done(k: int, walk: Walk) -> None:
+        walks[k] = walk
+        ended = sum(w is not None for w in walks)
+        report(f"episode {k}: {describe(walk.tally, metadata['control_dt'])} ({ended} of {options.episodes})")
 
     if options.workers == 1:
         for k in range(options.episodes):
-            done(k, mujoco_episode(options, path, k))
-        return tallies
+            done(k, mujoco_walk(options, path, k))
+        return walks
     context = multiprocessing.get_context("spawn")  # JAX's threads don't survive a fork
     with concurrent.futures.ProcessPoolExecutor(min(options.workers, options.episodes), context) as pool:
-        jobs = {pool.submit(mujoco_episode, options, path, k): k for k in range(options.episodes)}
+        jobs = {pool.submit(mujoco_walk, options, path, k): k for k in range(options.episodes)}
         for job in concurrent.futures.as_completed(jobs):
             done(jobs[job], job.result())
-    return tallies
+    return walks
 
 
 def mujoco_episode(options: Options, path: Path, k: int) -> judge.Tally:
-    """Episode k in MuJoCo C."""
+    """What episode k in MuJoCo C comes to."""
+    return mujoco_walk(options, path, k).tally
+
+
+def mujoco_walk(
+    options: Options, path: Path, k: int, *, change: Callable[[Monitor], None] = lambda monitor: None
+) -> Walk:
+    """Episode k in MuJoCo C; `change` may set the monitor's thresholds before it begins."""
     from tlq.simulation import Simulation
 
     controller = Controller(path)
@@ -163,10 +198,31 @@ def mujoco_episode(options: Options, path: Path, k: int) -> judge.Tally:
     simulation.reset(start_phase(k))
     moment = simulation.moment()
     tally, origin = judge.begin(moment), moment.position
+    file = find_monitor(options.monitor)
+    if file is None:
+        while tally.ended == judge.RUNNING:
+            moment = simulation.step(direction(k))
+            tally = judge.update(tally, moment, origin, direction(k), controller.control_dt)
+        return Walk(tally, 0, None, 0.0, 0.0)
+    monitor = Monitor(file, path)
+    change(monitor)
+    return _watched(simulation, monitor, tally, origin, k)
+
+
+def _watched(simulation: Any, monitor: Monitor, tally: judge.Tally, origin: np.ndarray, k: int) -> Walk:
+    """Episode k, from its start on, with a monitor."""
+    controller, stood, alarm, highest = simulation.controller, 0.0, None, 0.0
     while tally.ended == judge.RUNNING:
-        moment = simulation.step(direction(k))
+        stood += controller.control_dt * monitor.standing
+        moment = simulation.hold() if monitor.standing else simulation.step(direction(k))
         tally = judge.update(tally, moment, origin, direction(k), controller.control_dt)
-    return tally
+        monitor.step(controller)
+        if monitor.decision.alarms and alarm is None:
+            alarm = float(tally.progress)
+        highest = max(highest, monitor.last)
+        if stood >= STOOD and not monitor.decision.resume and tally.ended == judge.RUNNING:
+            tally = tally._replace(ended=np.asarray(1.0 * judge.STUCK))
+    return Walk(tally, monitor.decision.alarms, alarm, stood, highest)
 
 
 def describe(tally: judge.Tally, dt: float) -> str:
@@ -186,10 +242,17 @@ def wilson(successes: int, trials: int, z: float = 1.959964) -> dict[str, float]
     return {"mean": mean, "low": max(middle - half, 0.0), "high": min(middle + half, 1.0)}
 
 
-def summary(options: Options, metadata: dict[str, Any], tallies: Sequence[judge.Tally]) -> dict[str, Any]:
-    """The figures over all episodes: JSON."""
+def summary(
+    options: Options,
+    metadata: dict[str, Any],
+    tallies: Sequence[judge.Tally],
+    watched: Sequence[Walk] | None = None,
+) -> dict[str, Any]:
+    """The figures over all episodes: JSON. `watched`: where there was a monitor, what came of it."""
     dt = metadata["control_dt"]
     runs = [_run(k, tally, dt) for k, tally in enumerate(tallies)]
+    for walk, one in zip(watched or (), runs, strict=False):
+        one |= {"alarms": walk.alarms, "first_alarm_m": walk.alarm_m, "stood_s": walk.stood}
     distance = np.array([r["distance_m"] for r in runs])
     swings, walked = sum(float(t.swings) for t in tallies), float(distance.sum())
     total = {name: sum(float(getattr(t, name)) for t in tallies) for name in ("work", "lift", "unsafe")}
@@ -202,6 +265,7 @@ def summary(options: Options, metadata: dict[str, Any], tallies: Sequence[judge.
         "seed": options.seed,
         "noise": options.noise,
         "perception": described(options.sensing()),
+        "monitor": _monitored(options, watched),
         "method": metadata["method"],
         "commit": metadata["commit"],
         "distance_m": {"mean": distance.mean(), "std": distance.std(), "min": distance.min()},
@@ -214,6 +278,18 @@ def summary(options: Options, metadata: dict[str, Any], tallies: Sequence[judge.
         "unsafe_foothold_share": total["unsafe"] / swings if swings else None,
         "speed_m_s": walked / sum(r["time_s"] for r in runs),
         "runs": runs,
+    }
+
+
+def _monitored(options: Options, watched: Sequence[Walk] | None) -> dict[str, Any] | None:
+    if watched is None:
+        return None
+    return {
+        "monitor": options.monitor,
+        "alarms": sum(walk.alarms for walk in watched),
+        "episodes_with_alarm": sum(walk.alarms > 0 for walk in watched),
+        "fell_after_alarm": sum(walk.alarms > 0 and int(walk.tally.ended) == judge.FELL for walk in watched),
+        "stood_s": sum(walk.stood for walk in watched),
     }
 
 
@@ -268,6 +344,11 @@ def table(result: dict[str, Any]) -> str:
         ("heading drift", number(result["heading_drift_rad"], 3, "rad")),
         ("unsafe footholds", number(result["unsafe_foothold_share"], 3, "")),
     ]
+    if result["monitor"] is not None:
+        said = "{episodes_with_alarm} episodes with an alarm, {fell_after_alarm} of them fell".format(
+            **result["monitor"]
+        )
+        rows.append(("monitor", said))
     head = "{terrain}, difficulty {difficulty:g}, {engine}, {episodes} episodes".format(**result)
     return "\n".join([head, *(f"{name:<18}{value}" for name, value in rows)])
 

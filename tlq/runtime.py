@@ -83,6 +83,8 @@ class Controller:
         """(M,) the policy's memory."""
         self.action = np.zeros(tg.ACTION_SIZE, np.float32)
         """(14,) what the policy gave last, in (-1, 1)."""
+        self.observation = np.zeros(self.core.observation_size, np.float32)
+        """(S,) what the policy was shown last."""
 
     def keep_heading(self) -> None:
         """Takes the present heading as the one to keep (at first that of `reset`), while everything else goes on."""
@@ -126,8 +128,8 @@ class Controller:
             if heights is None:
                 raise ValueError(f"heights is None; this policy needs an array of shape {_HEIGHTS}")
             heights = _array("heights", heights, _HEIGHTS)
-        observation = self.core.observe(self.state, measured, heights, direction)
-        self.action, self.memory = self._graph(observation, self.memory)
+        self.observation = self.core.observe(self.state, measured, heights, direction)
+        self.action, self.memory = self._graph(self.observation, self.memory)
         self.state, desired = self.core.act(self.state, self.action, measured, direction)
         return desired
 

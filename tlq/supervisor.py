@@ -3,9 +3,10 @@
     supervisor = Supervisor(Controller("policy.npz"))
     desired = supervisor.step(message or None, now)     # every control period; (12,) rad
 
-Every message is judged before it is used. While good ones come, the controller walks. Without one, it goes on with the
-last good state for `grace`, then is told to stand, and after `stand` more the joints are led slowly to the standing
-pose. It has no clock and no sockets: `now` is given, so that it can be tested in no time.
+Every message is judged before it is used. While good ones come, the controller walks, unless a `tlq.monitor` foresees a
+fall: then the joints are held. Without one, it goes on with the last good state for `grace`, then is told to stand, and
+after `stand` more the joints are led slowly to the standing pose. It has no clock and no sockets: `now` is given, so
+that it can be tested in no time.
 """
 
 import collections
@@ -17,6 +18,7 @@ import numpy as np
 
 import tg
 from tlq.messages import Sensing
+from tlq.monitor import Monitor
 from tlq.runtime import Controller
 
 
@@ -33,6 +35,8 @@ class Mode(enum.IntEnum):
     """A message is missing: the controller acts on the last good one."""
     STAND = 4
     """Messages are missing: the controller is told to stand, and fades the gait out."""
+    STOP = 5
+    """The monitor foresees a fall: the joints are held as they are."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,15 +72,23 @@ class SupervisorConfig:
 class Supervisor:
     """A controller that is fed with messages, or with none."""
 
-    def __init__(self, controller: Controller, config: SupervisorConfig | None = None):
-        """Takes a controller, which nobody else may step, and the limits."""
-        self.controller, self.config = controller, config or SupervisorConfig()
+    def __init__(
+        self, controller: Controller, config: SupervisorConfig | None = None, monitor: Monitor | None = None
+    ):
+        """Takes a controller, which nobody else may step, the limits, and what may stop it.
+
+        A stop for good by the monitor ends when the messages command standing, and then walking.
+        """
+        self.controller, self.config, self.monitor = controller, config or SupervisorConfig(), monitor
         self.mode = Mode.WAIT
         self.faults: collections.Counter[str] = collections.Counter()
         """How many control steps had no good message, by what was wrong: missing, late, order, orientation, ..."""
         self.last: Sensing | None = None
         """The newest good message."""
+        self.stops = 0
+        """How often the monitor had the robot stand."""
         self._heard = -math.inf  # when it was accepted
+        self._told = False  # to stand, since the monitor stopped the robot
         self._standing = np.asarray(controller.core.standing_target, float)
         self._desired = self._standing
 
@@ -164,14 +176,36 @@ class Supervisor:
             self.mode = Mode.POSE
             if fresh and risen:
                 self.controller.reset()
+                self._release()
                 self.mode = Mode.WALK
         elif fresh:
+            if self._stopped(self.last):
+                self.stops += self.mode is not Mode.STOP
+                self.mode = Mode.STOP
+                return
             if self.mode is Mode.STAND and not self.controller.state.gate > 0:
                 self._start_again()
             self.mode = Mode.WALK
         else:  # half a period more: calls don't come at exact times
             held = silence <= c.grace + 0.5 * self.controller.control_dt
             self.mode = Mode.HOLD if held else Mode.STAND
+
+    def _stopped(self, message: Sensing) -> bool:
+        """Whether the monitor stops the robot; not after standing was commanded, and then walking."""
+        if self.monitor is None or not self.monitor.standing:
+            self._told = False
+            return False
+        if self._told and message.command.any():
+            self._release()
+            return False
+        self._told |= not message.command.any()
+        return True
+
+    def _release(self) -> None:
+        """Nothing that the monitor said before counts any more."""
+        self._told = False
+        if self.monitor is not None:
+            self.monitor.reset()
 
     def _start_again(self) -> None:
         """The gait was faded out: it starts as it always does, not from wherever in its cycle it was stopped."""
@@ -181,6 +215,9 @@ class Supervisor:
 
     def _wanted(self, message: Sensing) -> np.ndarray:
         """Desired joint angles (12,) rad, before the limit of their change."""
+        if self.mode is not Mode.POSE and self.monitor is not None and self.monitor.standing:
+            self.monitor.step(self.controller)
+            return np.asarray(self.controller.state.desired, float)
         if self.mode is not Mode.POSE:
             sensors, command = message.sensors, message.command
             if self.mode is Mode.STAND:
@@ -189,6 +226,8 @@ class Supervisor:
                 sensors, command = sensors | still, 0.0 * command
             heights = message.heights if self.controller.core.heights else None
             desired = np.asarray(self.controller.step(sensors, heights, command), float)
+            if self.monitor is not None:
+                self.monitor.step(self.controller)
             if np.isfinite(desired).all():
                 return desired
             self.faults["policy"] += 1
