@@ -53,6 +53,7 @@ LIMITS: dict[str, tuple[float, float]] = {
     "ppo.learning_rate_min": (1e-9, 1.0),
     "ppo.learning_rate_max": (1e-9, 1.0),
     "ppo.kl_target": (0.0, 10.0),
+    "ppo.kl_stop": (0.0, 1e3),
     "ppo.entropy": (0.0, 10.0),
     "ppo.value_loss": (0.0, 1e3),
     "ppo.max_grad_norm": (1e-6, 1e6),

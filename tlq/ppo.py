@@ -58,6 +58,8 @@ class PPOConfig:
     """Upper bound of the adaptive learning rate."""
     kl_target: float = 0.015
     """KL(old, new) of an iteration that the learning rate is steered to; 0 keeps the learning rate."""
+    kl_stop: float = 4.0
+    """Gradient steps are left out while the KL of their minibatch is beyond so many times the target; 0: none is."""
     entropy: float = 0.0
     """Weight of the entropy bonus."""
     value_loss: float = 0.5
@@ -371,8 +373,14 @@ class Learner:
                 params, state.normaliser, batch, carry[index], last[index], _keys(key, numbers[index])
             )
             grads, losses = jax.lax.pmean((grads, losses), AXIS)
-            carried = self._descend(params, opt_state, grads, state.learning_rate)
-            return carried, dict(losses, grad_norm=optax.global_norm(grads))
+            stepped = self._descend(params, opt_state, grads, state.learning_rate)
+            figures = dict(losses, grad_norm=optax.global_norm(grads))
+            if c.kl_target > 0 and c.kl_stop > 0:
+                # A step too far is seen by the next minibatch. A policy with little spread needs few to be lost.
+                far = losses["kl"] > c.kl_stop * c.kl_target
+                stepped = jax.tree.map(lambda old, new: jnp.where(far, old, new), carried, stepped)
+                figures["skipped"] = 1.0 * far
+            return stepped, figures
 
         (params, opt_state), losses = jax.lax.scan(
             gradient_step,
@@ -441,7 +449,7 @@ def _loss_metrics(losses: dict[str, jax.Array], minibatches: int) -> dict[str, j
         f"loss/{n}": jnp.mean(losses[n])
         for n in ("policy", "value", "entropy", "guide", "taken_over", "total", "grad_norm")
     }
-    figures |= {n: jnp.mean(losses[n]) for n in ("std", "std_max")}
+    figures |= {n: jnp.mean(losses[n]) for n in ("std", "std_max", "skipped") if n in losses}
     finite = jnp.isfinite(losses["total"]) & jnp.isfinite(losses["grad_norm"])
     kl = losses["kl"]
     return dict(figures, kl=jnp.mean(kl), kl_last=jnp.mean(kl[-minibatches:]), finite=jnp.all(finite))

@@ -71,6 +71,13 @@ def train(config: TrainConfig, env: Env | None = None, heights: int | None = Non
     goes_on = config.resume and has_checkpoint(folder)
     if config.init and not goes_on:
         state = initialise(state, config.init, config)
+        if config.ppo.kl_target > 0:
+            # It rises to what the policy bears within some iterations; the usual one may be far too high for a policy
+            # whose actions have little spread, which loses then in one update what it has learnt.
+            rate = jnp.float32(config.ppo.learning_rate_min)
+            state = dataclasses.replace(
+                state, learning_rate=jax.device_put(rate, state.learning_rate.sharding)
+            )
         if not int(state.normaliser.count.lo):
             state = measure_rest(learner, state)
     folder.mkdir(parents=True, exist_ok=True)

@@ -10,6 +10,7 @@ import sys
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 from brax.envs.base import Wrapper
 from brax.envs.wrappers.training import VmapWrapper
@@ -306,6 +307,26 @@ def test_the_learning_rate_follows_the_kl():
     assert float(rate(jnp.float32(9e-4), 0.001)) == pytest.approx(1e-3)
     assert float(rate(jnp.float32(1e-5), 1.0)) == pytest.approx(1e-5)
     assert adapt_learning_rate(3e-4, 1.0, dataclasses.replace(config, kl_target=0)) == 3e-4
+
+
+def test_no_step_follows_one_that_went_too_far():
+    """At a rate of 1 the first of four gradient steps changes the policy altogether; the others are left out."""
+    far = dataclasses.replace(
+        CONFIG, epochs=2, minibatches=2, kl_target=0.01, kl_stop=4.0, learning_rate=1.0, learning_rate_max=1.0
+    )
+    ends = {}
+    for name, config in {"stops": far, "goes on": dataclasses.replace(far, kl_stop=0.0)}.items():
+        learner = make_learner(config=config)
+        before, _ = learner.step(learner.init(0))  # only looks
+        after, figures = learner.step(dataclasses.replace(before, learning_rate=jnp.float32(1.0)))
+        ends[name] = before, after, figures
+    before, after, figures = ends["stops"]
+    assert float(figures["skipped"]) == 3 / 4 and "skipped" not in ends["goes on"][2]
+    # Adam's first step is the rate times the gradient's sign, or less where the gradient is about as small as eps.
+    moved = jax.tree.map(lambda a, b: jnp.abs(b - a).max(), before.params.policy, after.params.policy)
+    assert 0.9 < max(jax.tree.leaves(moved)) <= 1.0 + 1e-5
+    assert int(optax.tree_utils.tree_get(after.opt_state, "count")) == 1
+    assert int(optax.tree_utils.tree_get(ends["goes on"][1].opt_state, "count")) == 4
 
 
 def test_figures_of_episodes_are_means_over_episodes():
