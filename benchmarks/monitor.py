@@ -9,6 +9,7 @@ was chosen before, on other episodes, and is among those that are tried.
 """
 
 import dataclasses
+import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from typing import Any
 import numpy as np
 
 import terrains
+from benchmarks import timing
 from tlq import cli, evaluate, judge
 from tlq.cli import find_monitor, find_policy, option
 from tlq.evaluate import Walk
@@ -54,8 +56,7 @@ def numbers(name: str, text: str, most: float) -> list[float]:
 def measure(options: Options, report: Callable[[str], None] = print) -> dict[str, Any]:
     """All walks; what the JSON file holds."""
     path, file = find_policy(options.policy), find_monitor(options.monitor)
-    if file is None:
-        raise ValueError("monitor=none measures nothing; choose a monitor")
+    assert file is not None  # see `check`
     asked = evaluate.Options(
         policy=str(path),
         terrain=options.terrain,
@@ -68,20 +69,32 @@ def measure(options: Options, report: Callable[[str], None] = print) -> dict[str
     )
     stops, resumes = numbers("stops", options.stops, 1.0), numbers("resumes", options.resumes, 60.0)
     own = Monitor(file, path).decision.stop
-    base = [walk(asked, path, k, Decision(1.0, 0.5, 0.0), report) for k in range(options.episodes)]
+    base = [walk(asked, path, k, Decision.at(1.0, 0.0), report) for k in range(options.episodes)]
     rows = []
     for resume in resumes:
         for stop in sorted({*stops, own}, reverse=True):
             # A walk in which no probability went beyond the threshold is the same again.
             watched = [
-                walk(asked, path, k, Decision(stop, 0.5 * stop, resume), report) if w.highest > stop else w
+                walk(asked, path, k, Decision.at(stop, resume), report) if w.highest > stop else w
                 for k, w in enumerate(base)
             ]
             rows.append(
                 {"stop": stop, "resume": resume, "of_the_file": stop == own, **compare(base, watched)}
             )
             report(str(rows[-1]))
-    return {**dataclasses.asdict(options), "rows": rows}
+    return {"rows": rows}
+
+
+def check(options: Options) -> None:
+    """Raises ValueError on options out of range, before anything takes long."""
+    terrains.parse_difficulty(options.difficulty)
+    if options.episodes < 1:
+        raise ValueError(f"episodes={options.episodes} must be at least 1")
+    if options.seed < 0:
+        raise ValueError(f"seed={options.seed} must be 0 or more")
+    if find_monitor(options.monitor) is None:
+        raise ValueError("monitor=none measures nothing; choose a monitor")
+    cli.check_folders(options, "json", "picture")
 
 
 def walk(
@@ -154,10 +167,9 @@ def draw(figures: dict[str, Any], path: str) -> None:
 def main(arguments: Sequence[str]) -> None:
     """The command line."""
     options = cli.parse(Options, arguments, __doc__ or "")
-    cli.check_folders(options, "json", "picture")
-    figures = measure(options, lambda line: print(line, flush=True))
-    if options.json:
-        evaluate.write_json(options.json, figures)
+    check(options)
+    figures = measure(options, lambda line: print(line, file=sys.stderr, flush=True))
+    timing.put_out(figures, dataclasses.asdict(options), options.json)
     if options.picture:
         draw(figures, options.picture)
 

@@ -21,6 +21,7 @@ MAY_IMPORT = {
 ON_THE_ROBOT = (
     "tlq/__init__.py",
     "tlq/runtime.py",
+    "tlq/calibration.py",
     "tlq/graph.py",
     "tlq/messages.py",
     "tlq/monitor.py",

@@ -5,7 +5,10 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+
+import terrains
 
 ROOT = Path(__file__).parents[1]
 SMALL = ["num_envs=16", "num_terrains=12", "rounds=1"]
@@ -69,6 +72,31 @@ def test_monitor_compares_pair_by_pair():
     assert found["distance_lost"] == pytest.approx(3 / 17)
     assert found["falls_per_10_m_with"] == pytest.approx(30 / 14)
     assert (found["alarms"], found["stood_s"], found["reached_with"]) == (3, 9.0, 1)
+
+
+def test_a_branched_simulation_goes_on_as_the_first_one(tmp_path):
+    """Both from the same moment, with the same noise; and stepping one doesn't move the other."""
+    from benchmarks import stopping
+    from tlq import cli, evaluate
+    from tlq.config import training_env
+    from tlq.runtime import Controller
+    from tlq.simulation import Simulation
+
+    controller = Controller(cli.find_policy("flat"))
+    config = training_env(controller.metadata)
+    terrain = terrains.make_terrain("flat", 0.0, 9100)
+    sim = Simulation(controller, terrain, config, noise=config.randomisation, seed=1)
+    ahead = evaluate.direction(0)
+    for _ in range(20):
+        sim.step(ahead)
+    before, other = sim.data.qpos.copy(), stopping.branch(sim)
+    for _ in range(20):
+        other.step(ahead)
+    np.testing.assert_array_equal(sim.data.qpos, before)
+    assert np.abs(other.data.qpos - before).max() > 0.05
+    for _ in range(20):
+        sim.step(ahead)
+    np.testing.assert_array_equal(sim.data.qpos, other.data.qpos)
 
 
 @pytest.mark.slow

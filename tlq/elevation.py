@@ -231,11 +231,14 @@ class ElevationMap:
         cells = self.centre + np.stack(np.meshgrid(line, line, indexing="ij"), axis=-1).reshape(-1, 2)
         centres = (cells + 0.5) * self.config.cell
         where = self.index(cells)
-        known = np.isfinite(self.variance[where]) & ~self.bound[where]
-        known &= np.hypot(*(centres - self.position).T) <= reach
+        known = self._measured()[where] & (np.hypot(*(centres - self.position).T) <= reach)
         return np.column_stack([centres, self.height[where]])[known]
 
     # -- parts of it
+
+    def _measured(self) -> np.ndarray:
+        """Whether something was seen in cells (N·N,)."""
+        return np.isfinite(self.variance) & ~self.bound
 
     def _seen(self, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Heights (C,) m of cells (C, 2), and the numbers of those that were not seen and are no holes.
@@ -317,7 +320,7 @@ class ElevationMap:
         """Heights (N·N,) m at which cells are ground or not: the highest beside them, or their own if it is hardly
         lower; -inf far from any.
         """
-        measured = np.isfinite(self.variance) & ~self.bound
+        measured = self._measured()
         error = np.sqrt(np.where(measured, self.variance, 0.0))
         surely = self._highest(np.where(measured, self.height - error, -np.inf), self.config.reach)
         return np.where(measured & (self.height > surely - self.config.step), self.height, surely)
@@ -326,8 +329,9 @@ class ElevationMap:
         """Whether heights (C,) m measured in cells (C,) are of a floor below their surface (C,) m, rather than of a
         wall: a little further from the edge something lies as low.
         """
-        own = np.where(np.isfinite(self.variance) & ~self.bound, self.height, np.inf)
-        lowest = -self._highest(-own, self.config.reach + 1)[where]
+        lowest = -self._highest(np.where(self._measured(), -self.height, -np.inf), self.config.reach + 1)[
+            where
+        ]
         return (measured <= surface - self.config.step) & (
             np.abs(measured - lowest) <= self.config.least_gate
         )

@@ -170,11 +170,6 @@ def _walk_mujoco(options: Options, path: Path, metadata: dict[str, Any], report:
     return walks
 
 
-def mujoco_episode(options: Options, path: Path, k: int) -> judge.Tally:
-    """What episode k in MuJoCo C comes to."""
-    return mujoco_walk(options, path, k).tally
-
-
 def mujoco_walk(
     options: Options, path: Path, k: int, *, change: Callable[[Monitor], None] = lambda monitor: None
 ) -> Walk:

@@ -12,19 +12,20 @@
 
 import hashlib
 import json
-import math
 import os
-import zipfile
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from tlq.runtime import Controller
+from tlq.calibration import sigmoid
+from tlq.runtime import Controller, NpzError, read_npz
 
 FORMAT = "tlq-monitor"
 VERSION = 1
 LARGEST = 1 << 24
 """Bytes a monitor's file may unpack to."""
+GO = 0.5
+"""The lower threshold, as a share of the one for alarms."""
 CLIP = 5.0
 """Features are cut to ± this many standard deviations."""
 
@@ -89,6 +90,11 @@ class Decision:
         self.stop, self.go, self.resume = stop, go, resume
         self.reset()
 
+    @classmethod
+    def at(cls, stop: float, resume: float) -> "Decision":
+        """The one of a threshold, with the lower one that belongs to it."""
+        return cls(stop, GO * stop, resume)
+
     def reset(self) -> None:
         """Forgets all alarms."""
         self.standing = False
@@ -139,7 +145,7 @@ class Monitor:
     def probability(self, controller: Controller) -> float:
         """That the robot falls within `metadata["horizon"]` seconds, if it goes on; after `controller.step`."""
         x = features(controller.observation, controller.memory, controller.action)
-        return 0.5 + 0.5 * math.tanh(0.5 * float(logit(self.network, x)))
+        return float(sigmoid(logit(self.network, x)))
 
     def step(self, controller: Controller) -> bool:
         """One control period, after `controller.step` if there was one: whether to hold the joints in the next one."""
@@ -164,26 +170,11 @@ def load_monitor(path: str | os.PathLike[str]) -> tuple[dict[str, Any], Network]
     if not os.path.isfile(name):
         raise MonitorFileError(f"no monitor file at {name}")
     try:
-        arrays = _read(name)
+        arrays = read_npz(name, "monitor", ("metadata",), LARGEST)
         metadata = _metadata(arrays.pop("metadata"))
         return metadata, _network(metadata, arrays)
-    except MonitorFileError as error:
+    except (MonitorFileError, NpzError) as error:
         raise MonitorFileError(f"{name}: {error}") from None
-
-
-def _read(name: str) -> dict[str, np.ndarray]:
-    try:
-        with zipfile.ZipFile(name) as archive:
-            if sum(item.file_size for item in archive.infolist()) > LARGEST:
-                raise MonitorFileError("too large for a monitor's file")
-        with np.load(name, allow_pickle=False) as file:
-            if "metadata" not in file.files:
-                raise MonitorFileError("not a monitor's file: it has no metadata")
-            return {key: file[key] for key in file.files}
-    except MonitorFileError:
-        raise
-    except Exception as error:  # as in `tlq.runtime`: NumPy's reader raises many kinds
-        raise MonitorFileError(f"damaged, or not a monitor's file ({' '.join(str(error).split())})") from None
 
 
 def _metadata(array: np.ndarray) -> dict[str, Any]:

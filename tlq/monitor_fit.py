@@ -22,7 +22,7 @@ from tlq.episodes import Episode
 from tlq.evaluate import FIRST_SEED, write_json
 from tlq.export import commit
 from tlq.files import whole
-from tlq.monitor import Decision, Network, fingerprint, logit, save_monitor
+from tlq.monitor import GO, Decision, Network, fingerprint, logit, save_monitor
 from tlq.runtime import load_policy
 
 SHARES = {"fit": 0.55, "stopping": 0.15, "calibration": 0.15, "test": 0.15}
@@ -34,6 +34,8 @@ EPOCHS, PATIENCE = 60, 6
 """The fit ends after so many passes over its steps, or after so many without a gain on the episodes for stopping."""
 THRESHOLDS = np.round(np.concatenate([np.arange(0.02, 0.1, 0.01), np.arange(0.1, 0.99, 0.025)]), 3)
 """Among these `stop` is chosen."""
+CALM = 1.0
+"""Alarms are counted anew after so long (s) below the lower threshold."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,10 +84,10 @@ def fit(options: Options, report: Callable[[str], None] = print) -> dict[str, An
         "seed": options.seed,
         "horizon": options.horizon,
         "stop": chosen,
-        "go": 0.5 * chosen,
+        "go": GO * chosen,
         "resume": options.resume,
         "test": measure(network, parts["test"], ahead),
-        "alarms": alarms(network, parts["test"], Decision(chosen, 0.5 * chosen, 1.0), options.horizon, dt),
+        "alarms": alarms(network, parts["test"], Decision.at(chosen, CALM), options.horizon, dt),
         "curve": trade(network, parts["test"], options, dt),
         "command": command(options),
         "date": time.strftime("%Y-%m-%d"),
@@ -305,7 +307,7 @@ def choose(network: Network, part: Sequence[Episode], options: Options, dt: floa
     """
     chosen = THRESHOLDS[-1]
     for stop in THRESHOLDS[::-1]:
-        found = alarms(network, part, Decision(stop, 0.5 * stop, 1.0), options.horizon, dt)
+        found = alarms(network, part, Decision.at(stop, CALM), options.horizon, dt)
         if found["false_alarms_per_10_m"] > options.false_alarms:
             break
         chosen = stop
@@ -315,7 +317,7 @@ def choose(network: Network, part: Sequence[Episode], options: Options, dt: floa
 def trade(network: Network, part: Sequence[Episode], options: Options, dt: float) -> list[dict[str, Any]]:
     """`alarms` at every threshold."""
     return [
-        {"stop": float(s), **alarms(network, part, Decision(s, 0.5 * s, 1.0), options.horizon, dt)}
+        {"stop": float(s), **alarms(network, part, Decision.at(s, CALM), options.horizon, dt)}
         for s in THRESHOLDS
     ]
 

@@ -51,7 +51,7 @@ class PPOConfig:
     clip: float = 0.2
     """Clipping range of the probability ratio."""
     learning_rate: float = 3e-4
-    """Adam's learning rate at the start."""
+    """Adam's learning rate at the start; a run with `init=` and a KL target starts at the lowest."""
     learning_rate_min: float = 1e-5
     """Lower bound of the adaptive learning rate."""
     learning_rate_max: float = 1e-3

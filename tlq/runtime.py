@@ -15,7 +15,7 @@ import json
 import math
 import os
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -38,6 +38,10 @@ _START_PHASE = 0.5 * math.pi
 
 class PolicyFileError(ValueError):
     """A file that holds no policy this version can run; the text says why."""
+
+
+class NpzError(ValueError):
+    """A file that isn't what it should be; the text says why."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -169,37 +173,41 @@ def load_policy(path: str | os.PathLike[str]) -> Policy:
     if not os.path.isfile(name):
         raise PolicyFileError(f"no policy file at {name}")
     try:
-        arrays = _read(name)
+        arrays = read_npz(name, "policy", ("graph", "metadata"), LARGEST)
         metadata, nodes = (_json(key, arrays.pop(key)) for key in ("metadata", "graph"))
         _check_version(metadata)
         core = _core(metadata)
         _check_arrays(arrays)
         policy = Policy(metadata, arrays, Graph(nodes, arrays), core)
         _try(policy)
-    except PolicyFileError as error:
+    except (PolicyFileError, NpzError) as error:
         raise PolicyFileError(f"{name}: {error}") from None
     except GraphError as error:
         raise PolicyFileError(f"{name}: its graph can't be run: {error}") from None
     return policy
 
 
-def _read(name: str) -> dict[str, np.ndarray]:
+def read_npz(name: str, what: str, needed: Sequence[str], largest: int) -> dict[str, np.ndarray]:
+    """Arrays of an npz file, without pickle; raises NpzError where it isn't a `what` file, holding `needed` ones.
+
+    largest: bytes that it may unpack to.
+    """
     try:
         with zipfile.ZipFile(name) as archive:
-            if sum(entry.file_size for entry in archive.infolist()) > LARGEST:
-                raise PolicyFileError("too large for a policy file")
+            if sum(entry.file_size for entry in archive.infolist()) > largest:
+                raise NpzError(f"too large for a {what} file")
         with np.load(name, allow_pickle=False) as file:
-            if not {"graph", "metadata"} <= set(file.files):
-                raise PolicyFileError("not a policy file: it has no graph and metadata")
+            if not set(needed) <= set(file.files):
+                raise NpzError(f"not a {what} file: it has no {' and '.join(needed)}")
             return {key: file[key] for key in file.files}
-    except PolicyFileError:
+    except NpzError:
         raise
     except zipfile.BadZipFile as error:
-        raise PolicyFileError(f"damaged, or not a policy file ({error})") from None
+        raise NpzError(f"damaged, or not a {what} file ({error})") from None
     except (
         Exception
     ) as error:  # NumPy reads the arrays' headers with Python's own parser, which raises many kinds
-        raise PolicyFileError(f"damaged ({' '.join(str(error).split())})") from None
+        raise NpzError(f"damaged ({' '.join(str(error).split())})") from None
 
 
 def _json(key: str, array: np.ndarray) -> Any:

@@ -71,13 +71,6 @@ def train(config: TrainConfig, env: Env | None = None, heights: int | None = Non
     goes_on = config.resume and has_checkpoint(folder)
     if config.init and not goes_on:
         state = initialise(state, config.init, config)
-        if config.ppo.kl_target > 0:
-            # It rises to what the policy bears within some iterations; the usual one may be far too high for a policy
-            # whose actions have little spread, which loses then in one update what it has learnt.
-            rate = jnp.float32(config.ppo.learning_rate_min)
-            state = dataclasses.replace(
-                state, learning_rate=jax.device_put(rate, state.learning_rate.sharding)
-            )
         if not int(state.normaliser.count.lo):
             state = measure_rest(learner, state)
     folder.mkdir(parents=True, exist_ok=True)
@@ -208,7 +201,9 @@ def _own(name: str, x: jax.Array) -> np.ndarray:
 def initialise(state: TrainState, source: str, config: TrainConfig | None = None) -> TrainState:
     """Parameters and normaliser from another run's folder or from a policy file (which has nothing for the critic).
 
-    config: of the run that starts; a policy that learnt with another range of residual angles is converted.
+    config: of the run that starts; a policy that learnt with another range of residual angles is converted. Where the
+      learning rate is steered it starts at the lowest: the usual one may be far too high for a policy whose actions
+      have little spread, which loses then in one update what it has learnt. It rises within some iterations.
     """
     path, before = Path(source), None
     if path.is_dir():
@@ -256,7 +251,12 @@ def initialise(state: TrainState, source: str, config: TrainConfig | None = None
         raise ValueError(f"init={source} doesn't fit: it has a part for footholds, which needs {needs}")
     parts = jax.tree.unflatten(jax.tree.structure(parts), flat)
     print(f"init: {len(taken)} of {len(flat)} arrays from {source}", flush=True)
-    return dataclasses.replace(state, params=parts["params"], normaliser=parts["normaliser"])
+    rate = state.learning_rate
+    if config is not None and config.ppo.kl_target > 0:
+        rate = jax.device_put(np.float32(config.ppo.learning_rate_min), rate.sharding)
+    return dataclasses.replace(
+        state, params=parts["params"], normaliser=parts["normaliser"], learning_rate=rate
+    )
 
 
 def _spread_times(factor: float, raw: np.ndarray) -> np.ndarray:

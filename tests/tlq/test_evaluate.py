@@ -199,7 +199,7 @@ def test_mujoco_walks_and_writes_what_it_found(file, tmp_path, capsys):
 
 
 def test_mujoco_repeats_itself(file):
-    first, second = (evaluate.mujoco_episode(flat(noise=True), file, 1) for _ in range(2))
+    first, second = (evaluate.mujoco_walk(flat(noise=True), file, 1).tally for _ in range(2))
     for a, b in zip(first, second, strict=True):
         np.testing.assert_array_equal(a, b)
 
@@ -232,7 +232,7 @@ def test_a_robot_on_its_belly_or_side_has_fallen(file):
 
 def test_timestep_must_divide_the_control_period(file):
     with pytest.raises(ValueError, match="timestep=0.003 doesn't divide"):
-        evaluate.mujoco_episode(flat(timestep=0.003), file, 0)
+        evaluate.mujoco_walk(flat(timestep=0.003), file, 0)
 
 
 def test_noise_has_the_configured_size():

@@ -88,7 +88,7 @@ def about(file, **changes):
     [
         ({"metadata": np.array("{")}, "its metadata isn't JSON"),
         ({"metadata": np.array("[]")}, "not a monitor's file of this program"),
-        ({"metadata": None}, "not a monitor's file: it has no metadata"),
+        ({"metadata": None}, "not a monitor file: it has no metadata"),
         ({"kernel_1": None}, r"kernel_1 must be float32 \(8, 1\)"),
         ({"bias_0": np.zeros(7, np.float32)}, r"bias_0 must be float32 \(8,\)"),
         ({"bias_0": np.zeros(8)}, r"bias_0 must be float32 \(8,\)"),

@@ -185,6 +185,12 @@ def test_a_run_can_start_from_another_ones_parameters(run, learner, tmp_path):
         if name.startswith(("params", "normaliser")):
             np.testing.assert_array_equal(x, arrays[name], err_msg=name)
     assert int(state.iteration) == 0
+    # Where the KL steers the learning rate it starts low, else as it is set.
+    for target, rate in ((0.01, 2e-5), (0.0, 1e-3)):
+        ppo = PPOConfig(kl_target=target, learning_rate=1e-3, learning_rate_min=2e-5)
+        fresh = dataclasses.replace(learner.init(7), learning_rate=jnp.float32(ppo.learning_rate))
+        begun = initialise(fresh, str(tmp_path / "run"), TrainConfig(ppo=ppo))
+        assert float(begun.learning_rate) == pytest.approx(rate)
 
 
 def test_a_run_can_start_from_a_policy_file(run, learner, tmp_path):
