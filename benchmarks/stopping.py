@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+import envs  # noqa: F401  (before Brax: its import of MJX prints on stdout)
 import terrains
 from benchmarks import timing
 from tlq import cli, evaluate

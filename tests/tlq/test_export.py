@@ -132,13 +132,14 @@ def test_training_starts_from_a_file(file, made, capsys):
     class Start:
         params: object
         normaliser: object
+        learning_rate: object
 
     @flax.struct.dataclass
     class Params:
         policy: object
 
     zeros = jax.tree.map(jnp.zeros_like, (made.params, made.normaliser))
-    state = initialise(Start(Params(zeros[0]), zeros[1]), str(file))
+    state = initialise(Start(Params(zeros[0]), zeros[1], jnp.float32(0.0)), str(file))
     jax.tree.map(np.testing.assert_array_equal, state.params.policy, made.params)
     np.testing.assert_array_equal(state.normaliser.std["state"], made.normaliser.std["state"])
 
