@@ -81,6 +81,7 @@ def make_env(policy: Policy, options: Options) -> envs.QuadrupedEnv:
                 enabled=False, difficulty=(options.difficulty,), depth=(options.depth,), revisit=0.0
             ),
             "stand_share": 0.0,
+            "stop_share": 0.0,
             "randomisation.push_speed": 0.0,
         },
     )

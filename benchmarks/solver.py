@@ -40,6 +40,7 @@ def make_env(num_planes: int = 1, iterations: int = 1) -> envs.QuadrupedEnv:
         spawn_offset=0.0,
         spawn_yaw=0.0,
         stand_share=0.0,
+        stop_share=0.0,
     )
     return envs.make(config)
 

@@ -105,6 +105,10 @@ class EnvConfig:
     """Longest episode (s)."""
     stand_share: float = 0.05
     """Share of the episodes that command standing."""
+    stop_share: float = 0.2
+    """Share of the others in which the robot is told once, at a random time, to stand for a while."""
+    stop_time: tuple[float, float] = (1.0, 3.0)
+    """For how long (s)."""
     spawn_yaw: float = 3.1416
     """Heading at the start, uniform in ± this (rad)."""
     spawn_offset: float = 0.1

@@ -179,6 +179,7 @@ class QuadrupedEnv(Env):
             practice=practice,
             floor=jnp.maximum(self.bank.floor[place], -depth),
             command=command,
+            stop=self._draw_stop(jax.random.fold_in(key, 12)),
             origin=xy,
             heading=yaw,
             progress=jnp.zeros(()),
@@ -187,6 +188,15 @@ class QuadrupedEnv(Env):
             randomised=self._randomise(next(keys)),
             key=next(keys),
         )
+
+    def _draw_stop(self, key: jax.Array) -> jax.Array:
+        """`Episode.stop`: (0, 0) in most episodes."""
+        c = self.config
+        stops, start, time = jax.random.uniform(key, (3,))
+        first = start * c.episode_time
+        last = first + c.stop_time[0] + (c.stop_time[1] - c.stop_time[0]) * time
+        steps = jnp.int32(jnp.clip(jnp.stack([first, last]) / c.control_dt, 0.0, 1e9))
+        return jnp.where(stops < c.stop_share, steps, 0)
 
     def _by_kind(self) -> tuple[np.ndarray, np.ndarray]:
         """Instances (N + 1, levels, M) int32 of the bank by kind id and level of the ladder; how many (N + 1, levels).
@@ -294,8 +304,17 @@ class QuadrupedEnv(Env):
     # -- senses
 
     def heading_command(self, episode: Episode) -> jax.Array:
-        """The command (2,) in the heading frame."""
-        return tg.frames.turn(-tg.frames.yaw(episode.qpos[3:7]), episode.command)
+        """The command (2,) in the heading frame, 0 while the robot is told to stand."""
+        return tg.frames.turn(-tg.frames.yaw(episode.qpos[3:7]), self.told(episode))
+
+    def told(self, episode: Episode) -> jax.Array:
+        """The command (2,) in the world, 0 while the robot is told to stand."""
+        first, last = episode.stop
+        return jnp.where((episode.step >= first) & (episode.step < last), 0.0, episode.command)
+
+    def stepping(self, episode: Episode) -> jax.Array:
+        """Whether feet in swing move, () bool: `Core`'s."""
+        return self.core.stepping(episode.controller, self.told(episode))
 
     def sense(self, episode: Episode) -> tg.Sensors:
         """What the robot measures, with noise; the same at every call on the same episode."""
@@ -474,11 +493,12 @@ class QuadrupedEnv(Env):
         step = rewards.Step(
             velocity=after.qvel[:2],
             angular_velocity=after.qvel[3:6],
-            command=after.command,
+            command=self.told(before),
             desired=after.controller.desired,
             previous=before.controller.desired,
             energy=rewards.energy(after.torque, after.qvel[6:], literal=c.literal),
-            swing=tg.path.leg_phases(after.controller.phase) > 0,
+            swing=(tg.path.leg_phases(after.controller.phase) > 0)
+            & self.core.stepping(after.controller, self.told(before)),
             near=below[:, self._near],
             highest=jnp.min(below, axis=1),
             lift=after.controller.lift,
@@ -514,7 +534,7 @@ class QuadrupedEnv(Env):
         there = self._heights(episode, self.landing_points(episode)[:, None] + offsets) + episode.qpos[2]
         highest = jnp.maximum(jnp.max(around, axis=1), jnp.max(there, axis=1))
         swing = tg.path.leg_phases(episode.controller.phase) > 0
-        swing &= jnp.sum(jnp.square(episode.command)) > 0.5
+        swing &= self.stepping(episode)
         return rewards.terrain(swing, -there, -highest, self.config.rewards.gap_threshold, graded=True)
 
     def _fell(self, episode: Episode, below: jax.Array, around: jax.Array) -> jax.Array:

@@ -124,8 +124,8 @@ def steps(env: QuadrupedEnv, episode: Episode) -> Steps:
     speed = 2.0 * controller.frequency * env.core.config.step_length
     ahead = jnp.clip(BALANCE * (env.velocity(episode) - speed * controller.stride), -AWAY, AWAY)
     danger = jnp.maximum(between(gaps, now), gaps[:, REACH, REACH]) > SAFE
-    walking = jnp.sum(jnp.square(episode.command)) > 0.5
-    return Steps(legs, ends, share, now, gaps, ahead, danger & (phases[legs] > LIFTING) & walking)
+    stepping = env.stepping(episode)
+    return Steps(legs, ends, share, now, gaps, ahead, danger & (phases[legs] > LIFTING) & stepping)
 
 
 def between(gaps: jax.Array, displacement: jax.Array) -> jax.Array:
@@ -233,8 +233,7 @@ def guide(env: QuadrupedEnv, episode: Episode, held: jax.Array) -> Guidance:
     held: (4, 2) m, of `Guided`.
     """
     s, controller = steps(env, episode), episode.controller
-    walking = jnp.sum(jnp.square(episode.command)) > 0.5
-    stance = (tg.path.leg_phases(controller.phase) <= 0) & walking
+    stance = tg.path.leg_phases(controller.phase) <= 0
     lead, last = _lead(env, episode)
     own = Guidance(
         lead=lead,

@@ -112,6 +112,8 @@ LIMITS: dict[str, tuple[float, float]] = {
     "num_planes": (1, 2),
     "episode_time": (0.1, 1e7),
     "stand_share": _SHARE,
+    "stop_share": _SHARE,
+    "stop_time": (0.0, 1e7),
     "spawn_yaw": (0.0, math.pi + 1e-3),
     "spawn_offset": (0.0, 0.2),
     "gap_depth": (0.0, 1.0),
@@ -132,7 +134,10 @@ ORDERED = (
 )
 """Pairs of which the first must not be larger than the second (element by element)."""
 _LEVELS = 3  # values of a `terrains.config.Levels`
-_PAIRS = ("randomisation.friction", "randomisation.payload", "randomisation.gain", "randomisation.latency")
+_PAIRS = (
+    *("randomisation.friction", "randomisation.payload", "randomisation.gain", "randomisation.latency"),
+    "stop_time",
+)
 
 
 def leaves(config: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:

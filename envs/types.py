@@ -46,6 +46,8 @@ class Episode(flax.struct.PyTreeNode):
     """() m, how deep the feet can fall."""
     command: jax.Array
     """(2,) unit vector in the world, or 0 to stand."""
+    stop: jax.Array
+    """(2,) int32, control steps from and to which the robot is told to stand, whatever the command."""
     origin: jax.Array
     """(2,) m, where the robot started."""
     heading: jax.Array

@@ -28,7 +28,7 @@ class Step(NamedTuple):
     energy: Array
     """() W, r_tau."""
     swing: Array
-    """(L,) bool, by the trajectory generator's phase."""
+    """(L,) bool, by the trajectory generator's phase, and none when the robot stands."""
     near: Array
     """(L, N) m, z_ij = foot height minus terrain height at the points that r_terrain looks at."""
     highest: Array
@@ -44,9 +44,8 @@ class Step(NamedTuple):
 def step_terms(c: RewardConfig, s: Step) -> dict[str, jax.Array]:
     """Every term () but `aim`, unweighted, by name."""
     walking = jnp.sum(jnp.square(s.command)) > 0.5
-    swing = s.swing & walking
     speed = along(s.velocity @ s.command, c.speed_low, c.speed_high, literal=c.literal)
-    gaps = terrain(~swing, s.near, s.highest, c.gap_threshold, graded=c.terrain_graded)
+    gaps = terrain(~s.swing, s.near, s.highest, c.gap_threshold, graded=c.terrain_graded)
     lifted = height(s.lift, s.rise, c.lift_threshold)
     return {
         "along": jnp.where(walking, speed, standing(s.velocity, c.speed_low)),
@@ -54,7 +53,7 @@ def step_terms(c: RewardConfig, s: Step) -> dict[str, jax.Array]:
         "smooth": smooth(s.desired, s.previous),
         "energy": s.energy,
         "terrain": jnp.mean(gaps),
-        "height": jnp.mean(jnp.where(swing, lifted, 0.0)),
+        "height": jnp.mean(jnp.where(s.swing, lifted, 0.0)),
         "yaw": -jnp.square(s.angular_velocity[2]),
         "heading": jnp.cos(s.drift) - 1.0,
         "tilt": -0.1 * jnp.sum(jnp.square(s.angular_velocity[:2])),

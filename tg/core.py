@@ -29,6 +29,9 @@ LAG = 0.07
 SMOOTHING = 0.3
 """Share of a new measurement in the velocity that the stance legs tell of."""
 
+_DOWN = 1e-3
+"""Sine of the phase below which all feet are down."""
+
 _MIRRORED_LEG = (1, 0, 3, 2)
 
 
@@ -287,12 +290,21 @@ class Core:
         frequency = c.base_frequency + c.frequency_range * action[0]
         moving = xp.where(xp.sum(command * command) > 0.25, 1.0 + 0.0 * frequency, 0.0 * frequency)
 
-        phase = path.wrap(
-            state.phase + moving * (path.advance(state.phase, frequency, self.dt) - state.phase)
-        )
+        phase = path.advance(state.phase, frequency, self.dt)
         step = self.dt / c.start_time
         gate = state.gate + xp.clip(moving - state.gate, -step, step)
         stride = state.stride + xp.clip(command - state.stride, -step, step)
+        if c.finish_step:
+            # Feet in swing come down where they were to, and all feet stay where they are then.
+            swinging = self._unfinished(state)
+            down = xp.where(state.phase > 0, -math.pi + 0.0 * phase, 0.0 * phase)
+            landed = xp.where(phase * state.phase > 0, phase, down)
+            finishing = xp.where(swinging, landed, state.phase)
+            phase = xp.where(moving > 0, phase, finishing)
+            gate = xp.where((moving > 0) | ~swinging, gate, state.gate)
+            stride = xp.where(moving > 0, stride, state.stride)
+        else:
+            phase = xp.where(moving > 0, phase, state.phase)
         phases = path.leg_phases(phase)
         lift = xp.where(phases > 0, state.lift, self._lift(action[1]))
 
@@ -323,6 +335,21 @@ class Core:
             velocity=velocity,
         )
         return state, desired
+
+    def stepping(self, state: ControllerState, command: Array) -> Array:
+        """Whether feet that are in swing by their phase move, () bool: with a command, and to the end of the last step.
+
+        command: (2,) unit vector, or 0 to stand.
+        """
+        xp = command.__array_namespace__()
+        told = xp.sum(command * command) > 0.25
+        return told | self._unfinished(state) if self.config.finish_step else told
+
+    @staticmethod
+    def _unfinished(state: ControllerState) -> Array:
+        """Whether feet are off the ground, () bool."""
+        xp = state.phase.__array_namespace__()
+        return (state.gate > 0) & (xp.abs(xp.sin(state.phase)) > _DOWN)
 
     def foot_targets(
         self, phases: Array, lift: Array, stride: Array, sensors: Sensors, level: Array | None = None

@@ -50,6 +50,7 @@ def evaluation_config(
         curriculum=ladder,
         episode_time=1e6,
         stand_share=0.0,
+        stop_share=0.0,
         spawn_yaw=0.0,
         spawn_offset=0.0,
         end_in_gap=False,

@@ -89,7 +89,7 @@ class RewardMeter:
             desired=state.desired,
             previous=self._desired,
             energy=-work / sim.controller.control_dt,
-            swing=moment.phases > 0,
+            swing=(moment.phases > 0) & sim.controller.core.stepping(state, command),
             near=below[:, tg.samples.within(config.terrain_ring)],
             highest=below.min(axis=1),
             lift=state.lift,

@@ -78,8 +78,56 @@ def test_lift_is_held_from_lift_off_to_touch_down(subject):
         before = state
 
 
-def test_a_command_to_stand_freezes_the_phase(subject):
+@pytest.mark.parametrize("steps", range(38, 52))  # more than half a cycle: from any phase
+def test_told_to_stand_it_finishes_its_step_and_stays(subject, steps):
+    core, still = subject.core, np.zeros(14)
+    walking = walk(core, steps, action=still)[-1][0]
+    standing = walk(core, 40, command=STAND, state=walking, action=still)
+    moving = [core.stepping(state, STAND) for state, _ in standing]
+    # No longer than half a cycle, and without a pause in between.
+    assert sum(moving) * core.dt < 0.5 / core.config.base_frequency + 1e-9
+    assert moving == sorted(moving, reverse=True)
+    for (before, _), (after, _) in itertools.pairwise([(walking, None), *standing]):
+        if core.stepping(before, STAND):
+            swing, phase = tg.path.leg_phases(before.phase) > 0, tg.path.leg_phases(after.phase)
+            step = 2 * np.pi * core.config.base_frequency * core.dt
+            ahead = np.minimum(tg.path.leg_phases(before.phase)[swing] + step, np.pi)
+            np.testing.assert_allclose(np.abs(phase[swing]), ahead)
+    last, desired = standing[-1]
+    assert last.gate == 0.0 and not (tg.path.leg_phases(last.phase) > 0).any()
+    # All feet are down, where their step led them: the ones that came down last in front.
+    landed = np.array([1, -1, -1, 1]) * (1 if last.phase == -np.pi else -1)
+    along = 0.5 * core.config.step_length * landed
+    expected = core.base_foot + along[:, None] * np.array([*walking.stride, 0.0])
+    np.testing.assert_allclose(last.targets[0].reshape(4, 3), expected, atol=1e-9)
+    assert all(desired is not None for _, desired in standing)
+    # And it goes on where it stopped.
+    again = walk(core, 1, state=last, action=still)[0][0]
+    advance = 2 * np.pi * core.config.base_frequency * core.dt
+    assert again.phase == pytest.approx(tg.path.wrap(last.phase + advance))
+    np.testing.assert_array_equal(again.stride, last.stride)
+
+
+def test_one_told_to_stand_before_it_has_moved_stays(subject):
     core = subject.core
+    start = core.initial_state(np.asarray(0.5 * np.pi))
+    assert not core.stepping(start, STAND)
+    for state, desired in walk(core, 10, command=STAND, state=start, action=np.zeros(14)):
+        assert state.phase == start.phase and state.gate == 0.0
+        np.testing.assert_allclose(desired, core.standing_target, atol=1e-9)
+
+
+def test_the_phase_at_rest_is_stance_for_all_feet_in_single_precision(subject):
+    core = subject.make(np.float32)
+    for steps in (20, 33):
+        walking = walk(core, steps, action=np.zeros(14, np.float32))[-1][0]
+        last = walk(core, 40, command=STAND.astype(np.float32), state=walking)[-1][0]
+        assert last.phase.dtype == np.float32
+        assert not (tg.path.leg_phases(last.phase) > 0).any()
+
+
+def test_without_finish_step_a_command_to_stand_freezes_the_phase(subject):
+    core = subject.make(np.float64, finish_step=False)
     walking = walk(core, 40, action=np.zeros(14))[-1][0]
     standing = walk(core, 40, command=STAND, state=walking, action=np.zeros(14))
     assert all(state.phase == walking.phase for state, _ in standing)

@@ -314,7 +314,7 @@ def test_a_gap_below_a_standing_foot_costs(flat):
         desired=np.zeros(12),
         previous=np.zeros(12),
         energy=0.0,
-        swing=np.ones(4, bool),
+        swing=np.zeros(4, bool),
         near=below[:, :7],
         highest=below.min(axis=1),
         lift=np.zeros(4),
