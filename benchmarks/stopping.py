@@ -1,9 +1,9 @@
-"""What becomes of a robot that is stopped at a random moment of a walk, by three ways of stopping, or walks on.
+"""What becomes of a robot that is told to stand at a random moment of a walk, by two ways of stopping, or walks on.
 
     python -m benchmarks.stopping policy=poles terrain=poles difficulty=0.8 episodes=30 json=FILE
 
-`walk_on`: it isn't stopped. `command`: the command becomes 0 at once. `touch_down`: at the next touch-down. `hold`: at
-the next touch-down the desired joint angles stay as they are, as `tlq.monitor` has it. In MuJoCo C with training's
+`walk_on`: it isn't. `finish`: the feet end their step and stay (`tg.finish_step`). `fade`: the gait fades out wherever
+in its cycle it is. `go_on`: as `finish` for 1.5 s, then it walks again. In MuJoCo C with training's
 noise, on terrains of training's seeds; all of them from the same moment, 1.4 to 2.6 s after the start. Counted are
 falls within three seconds.
 """
@@ -25,7 +25,7 @@ from tlq.config import training_env
 from tlq.runtime import Controller
 from tlq.simulation import Simulation
 
-WAYS = ("walk_on", "command", "touch_down", "hold")
+WAYS = ("walk_on", "finish", "go_on", "fade")
 FROM, TO, WATCHED = 70, 130, 150
 """Control steps: the stop comes between the first two, and the robot is watched for so long."""
 
@@ -65,14 +65,12 @@ def branch(sim: Simulation) -> Simulation:
 
 def falls(sim: Simulation, way: str, direction: np.ndarray) -> bool:
     """Whether the robot falls when it is stopped in a way from now on."""
-    swing, landed = sim.controller.state.phase > 0, way == "command"
-    for _ in range(WATCHED):
-        landed = landed or (way != "walk_on" and (sim.controller.state.phase > 0) != swing)
-        if landed and way == "hold":
-            moment = sim.hold()
-        else:
-            moment = sim.step((0.0 if landed else 1.0) * direction)
-        if moment.fell:
+    core = sim.controller.core
+    config = dataclasses.replace(core.config, finish_step=way != "fade")
+    sim.controller.core = dataclasses.replace(core, config=config)
+    for k in range(WATCHED):
+        walks = way == "walk_on" or (way == "go_on" and k >= WATCHED // 2)
+        if sim.step((1.0 if walks else 0.0) * direction).fell:
             return True
     return False
 

@@ -300,7 +300,11 @@ class Core:
             down = xp.where(state.phase > 0, -math.pi + 0.0 * phase, 0.0 * phase)
             landed = xp.where(phase * state.phase > 0, phase, down)
             finishing = xp.where(swinging, landed, state.phase)
-            phase = xp.where(moving > 0, phase, finishing)
+            # From a step's end on the stride is there at once: so it's the phase that gathers speed. From the middle of
+            # a step on, as after a reset, the stride is never ahead of the gate.
+            rate = 1.0 - xp.maximum(xp.max(xp.abs(stride)) - gate, 0.0 * gate)
+            starting = path.advance(state.phase, rate * frequency, self.dt)
+            phase = xp.where(moving > 0, starting, finishing)
             gate = xp.where((moving > 0) | ~swinging, gate, state.gate)
             stride = xp.where(moving > 0, stride, state.stride)
         else:

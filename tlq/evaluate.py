@@ -209,7 +209,7 @@ def _watched(simulation: Any, monitor: Monitor, tally: judge.Tally, origin: np.n
     controller, stood, alarm, highest = simulation.controller, 0.0, None, 0.0
     while tally.ended == judge.RUNNING:
         stood += controller.control_dt * monitor.standing
-        moment = simulation.hold() if monitor.standing else simulation.step(direction(k))
+        moment = simulation.step((0.0 if monitor.standing else 1.0) * direction(k))
         tally = judge.update(tally, moment, origin, direction(k), controller.control_dt)
         monitor.step(controller)
         if monitor.decision.alarms and alarm is None:

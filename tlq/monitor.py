@@ -3,8 +3,7 @@
     controller = Controller("policy.npz")
     monitor = Monitor("monitor.npz", "policy.npz")
     while True:                                           # every `control_dt` seconds
-        if not monitor.standing:                          # else the joints keep the last q_des
-            q_des = controller.step(sensors, heights, command)
+        q_des = controller.step(sensors, heights, 0 * command if monitor.standing else command)
         monitor.step(controller)
 
 `python -m tlq.monitor_fit` makes the file. Letters: S observed values, M of memory, F = S + M + 14 features.
@@ -116,11 +115,7 @@ class Decision:
 
 
 class Monitor:
-    """Watches one controller, and says when the joints are to be held as they are.
-
-    After an alarm that is from the next touch-down on, when all feet are on the ground. (A command of 0 would fade the
-    gait out wherever in its cycle it is, and drag the feet below the hips.)
-    """
+    """Watches one controller, and says when the robot is to be told to stand."""
 
     def __init__(self, path: str | os.PathLike[str], policy: str | os.PathLike[str]):
         """Reads a monitor's file; raises MonitorFileError if it can't be used with the policy's file."""
@@ -139,25 +134,17 @@ class Monitor:
         self.last = 0.0
         """The last probability."""
         self.standing = False
-        """Whether the joints are to be held, and the controller isn't to be stepped."""
-        self._swing: bool | None = None  # whether LF was in swing
+        """Whether the command is to be 0."""
 
     def probability(self, controller: Controller) -> float:
-        """That the robot falls within `metadata["horizon"]` seconds, if it goes on; after `controller.step`."""
+        """That the robot falls within `metadata["horizon"]` seconds by the command it has; after `controller.step`."""
         x = features(controller.observation, controller.memory, controller.action)
         return float(sigmoid(logit(self.network, x)))
 
     def step(self, controller: Controller) -> bool:
-        """One control period, after `controller.step` if there was one: whether to hold the joints in the next one."""
-        if self.standing:  # nothing new was seen; time goes by
-            self.standing = self.decision.step(0.0, controller.control_dt)
-            return self.standing
+        """One control period, after `controller.step`: whether the robot is to stand in the next one."""
         self.last = self.probability(controller)
-        alarmed = self.decision.step(self.last, controller.control_dt)
-        swing = bool(controller.state.phase > 0)
-        landed = swing != self._swing or not controller.state.gate > 0
-        self._swing = swing
-        self.standing = alarmed and landed
+        self.standing = self.decision.step(self.last, controller.control_dt)
         return self.standing
 
 

@@ -89,13 +89,6 @@ class Simulation:
         self.look()
         return self.moment(work)
 
-    def hold(self) -> Moment:
-        """One control period in which the desired joint angles stay as they are."""
-        desired = np.asarray(self.controller.state.desired, float)
-        work = sum(self.substep(desired) for _ in range(self.substeps))
-        self.look()
-        return self.moment(work)
-
     def moment(self, work: float = 0.0) -> Moment:
         """The present state, as the judge sees it."""
         return Moment(

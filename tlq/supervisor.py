@@ -4,7 +4,7 @@
     desired = supervisor.step(message or None, now)     # every control period; (12,) rad
 
 Every message is judged before it is used. While good ones come, the controller walks, unless a `tlq.monitor` foresees a
-fall: then the joints are held. Without one, it goes on with the last good state for `grace`, then is told to stand, and
+fall: then it is told to stand. Without one, it goes on with the last good state for `grace`, then is told to stand, and
 after `stand` more the joints are led slowly to the standing pose. It has no clock and no sockets: `now` is given, so
 that it can be tested in no time.
 """
@@ -34,9 +34,9 @@ class Mode(enum.IntEnum):
     HOLD = 3
     """A message is missing: the controller acts on the last good one."""
     STAND = 4
-    """Messages are missing: the controller is told to stand, and fades the gait out."""
+    """Messages are missing: the controller is told to stand, and ends its step."""
     STOP = 5
-    """The monitor foresees a fall: the joints are held as they are."""
+    """The monitor foresees a fall: the controller is told to stand."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,7 +50,7 @@ class SupervisorConfig:
     grace: float = 0.04
     """Without a good message, the last good state serves this long (s): two control periods."""
     stand: float = 0.5
-    """Then the controller stands for this long (s), the gait being faded out in the first 0.2 s."""
+    """Then the controller stands for this long (s), its step being ended in the first 0.25 s."""
     max_change: float = 0.3
     """Change of a desired joint angle in a control period (rad). Walking needs up to 0.2."""
     pose_speed: float = 0.5
@@ -183,7 +183,8 @@ class Supervisor:
                 self.stops += self.mode is not Mode.STOP
                 self.mode = Mode.STOP
                 return
-            if self.mode is Mode.STAND and not self.controller.state.gate > 0:
+            fades = not self.controller.core.config.finish_step
+            if self.mode in (Mode.STAND, Mode.STOP) and fades and not self.controller.state.gate > 0:
                 self._start_again()
             self.mode = Mode.WALK
         else:  # half a period more: calls don't come at exact times
@@ -208,18 +209,17 @@ class Supervisor:
             self.monitor.reset()
 
     def _start_again(self) -> None:
-        """The gait was faded out: it starts as it always does, not from wherever in its cycle it was stopped."""
+        """A gait that was faded out starts as it always does, not from wherever in its cycle it was stopped."""
         turn = self.controller.state.turn
         self.controller.reset()
         self.controller.state = self.controller.state._replace(turn=turn)
 
     def _wanted(self, message: Sensing) -> np.ndarray:
         """Desired joint angles (12,) rad, before the limit of their change."""
-        if self.mode is not Mode.POSE and self.monitor is not None and self.monitor.standing:
-            self.monitor.step(self.controller)
-            return np.asarray(self.controller.state.desired, float)
         if self.mode is not Mode.POSE:
             sensors, command = message.sensors, message.command
+            if self.monitor is not None and self.monitor.standing:
+                command = 0.0 * command
             if self.mode is Mode.STAND:
                 # The old speeds say nothing of now; the gyro's would be summed up into a turn that wasn't.
                 still = {name: 0.0 * sensors[name] for name in ("angular_velocity", "joint_velocity")}
