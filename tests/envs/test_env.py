@@ -167,6 +167,38 @@ def test_episodes_begin_on_the_platform_at_rest(exact):
         assert lowest == pytest.approx(exact.env.robot.foot_radius, abs=0.002)
 
 
+def test_some_are_told_once_to_stand_for_a_while(exact):
+    env = exact.env
+    asked = dataclasses.replace(exact.config, stop_share=0.3, stop_time=(1.0, 3.0))
+    other = object.__new__(type(env))
+    other.__dict__.update(env.__dict__ | {"config": asked})
+    stops = np.asarray(jax.vmap(other._draw_stop)(jax.random.split(jax.random.key(0), 4000)))
+    told = stops[:, 1] > stops[:, 0]
+    assert told.mean() == pytest.approx(0.3, abs=0.03) and not stops[~told].any()
+    first, steps = stops[told, 0], np.diff(stops[told])[:, 0]
+    assert first.min() >= 0 and first.max() < env.episode_steps
+    assert np.quantile(first, [0.25, 0.5, 0.75]) == pytest.approx([125, 250, 375], abs=20)
+    assert steps.min() >= 49 and steps.max() <= 151 and steps.mean() == pytest.approx(100, abs=3)
+    assert not np.asarray(jax.vmap(env._draw_stop)(jax.random.split(jax.random.key(0), 100))).any()
+
+
+def test_told_to_stand_it_is_seen_and_rewarded(exact):
+    state = change(exact.state, command=LEFT, stop=np.array([3, 6]), qpos=standing(exact.env))
+    shown, paid = [], []
+    for _ in range(8):
+        shown.append(float(np.linalg.norm(state.obs["state"][:2])))
+        state = exact.step(state, ZERO)
+        v = np.asarray(state.pipeline_state.qvel[:2])
+        standing_pay = 1.0 - min(np.linalg.norm(v) / exact.config.rewards.speed_low, 1.0)
+        walking_pay = np.clip(v @ LEFT / exact.config.rewards.speed_low, -0.5, 1.0)
+        weight = exact.config.rewards.along
+        paid.append([float(state.metrics["reward/along"]) / weight - p for p in (walking_pay, standing_pay)])
+    # The first observation is of the state as it was made, before the command was changed.
+    np.testing.assert_allclose(shown[1:], [1, 1, 0, 0, 0, 1, 1], atol=1e-6)
+    for k, (as_walking, as_standing) in enumerate(paid):
+        assert (as_standing if 3 <= k < 6 else as_walking) == pytest.approx(0.0, abs=1e-5)
+
+
 @pytest.mark.slow
 def test_it_stands_as_high_as_it_should(exact):
     """A command to stand: a second later the weight's compensation holds the trunk where it was meant to be."""
@@ -603,7 +635,8 @@ def test_terrain_term_looks_at_the_feet_in_stance(exact):
     low = deep[:, :7].mean(axis=1)
     assert 0 < low[0] < 1
     np.testing.assert_allclose(terms["terrain"], -(low * (phases <= 0)).mean(), atol=1e-6)
-    standing_terms = env._reward_terms(episode, change_episode(episode, command=np.zeros(2)), below, around)
+    still = change_episode(episode, command=np.zeros(2))
+    standing_terms = env._reward_terms(still, still, below, around)
     np.testing.assert_allclose(standing_terms["terrain"], -low.mean(), atol=1e-6)  # all feet stand
     assert standing_terms["height"] == 0
 

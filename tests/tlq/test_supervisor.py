@@ -167,8 +167,21 @@ def test_it_recovers(file, missing):
     assert rig.supervisor.controller.state.gate == 1.0  # walking, not only allowed to
 
 
-def test_after_standing_the_gait_starts_as_it_always_does(file):
+def test_after_standing_it_goes_on_from_the_end_of_its_step(file):
     rig = Rig(file).walk(37)
+    controller = rig.supervisor.controller
+    for _ in range(26):  # 0.24 s for the rest of the step, 0.2 s until the gate is shut
+        rig.step(None)
+    assert rig.mode is Mode.STAND and controller.state.gate == 0.0
+    stood = controller.state
+    rig.step(rig.message(command=STILL))
+    assert controller.state.phase == stood.phase and np.sin(stood.phase) == pytest.approx(0.0, abs=1e-6)
+    assert np.array_equal(controller.state.stride, stood.stride) and stood.stride.any()
+
+
+def test_after_standing_a_gait_that_fades_out_starts_as_it_always_does(tmp_path):
+    fading = trained(spread=0.0, **SMALL, **{"env.tg.finish_step": False})
+    rig = Rig(fading.export(tmp_path / "policy.npz")).walk(37)
     controller = rig.supervisor.controller
     controller.state = controller.state._replace(turn=np.float32(0.2))
     for _ in range(20):
