@@ -61,6 +61,7 @@ LIMITS: dict[str, tuple[float, float]] = {
     "ppo.guide": (0.0, 1e3),
     "ppo.guide_rate": (0.0, 1.0),
     "ppo.guide_epochs": (1, 1000),
+    "ppo.average": (0.0, 0.99999),
     "ppo.taken_over": (0.0, 1e3),
     "init_spread": (0.01, 100.0),
 }

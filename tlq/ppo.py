@@ -76,6 +76,9 @@ class PPOConfig:
     """Adam's learning rate of the part of the policy that leads feet to footholds."""
     guide_epochs: int = 2
     """Passes over the data of an iteration in which the guide teaches that part."""
+    average: float = 0.98
+    """What an iteration keeps of the average of the policy's parameters, which is what `policy.npz` holds: the last 50
+    iterations or so, without the noise of single updates. 0: the last parameters."""
     taken_over: float = 0.0
     """Weight in PPO's loss of the squares of the rest's residuals, before tanh, as far as that part takes them over.
     They have no effect then and drift off, to where there is much to make up for whenever the share changes. Whether
@@ -87,6 +90,7 @@ class TrainState:
     """All that an iteration reads and changes."""
 
     params: PPONetworkParams
+    average: Any  # of the policy's parameters over the last iterations (`PPOConfig.average`)
     opt_state: Any  # of PPO
     guide_opt_state: Any  # of the footholds that the guide teaches; () without
     learning_rate: jax.Array  # ()
@@ -164,7 +168,7 @@ class Learner:
         )
         self._loss = functools.partial(ppo_loss, networks=networks, config=config, axis=AXIS)
         self._foothold_loss = functools.partial(foothold_loss, networks=networks)
-        specs: list[Any] = [P(), P(), P(), P(), P(), P(AXIS), P(), P()]  # only the environments are split
+        specs: list[Any] = [P(), P(), P(), P(), P(), P(), P(AXIS), P(), P()]  # only the environments are split
         self.specs = TrainState(*specs)
         self._hoist()
         # Nothing is donated: the state before an update stays whole, so that a failed one can be saved and replayed.
@@ -252,6 +256,7 @@ class Learner:
         seen = {name: jnp.zeros(env_state.obs[name].shape[1:]) for name in NORMALISED}
         state = TrainState(
             params=params,
+            average=params.policy,
             opt_state=self._optimiser.init(params),
             guide_opt_state=()
             if self.networks.footholds is None
@@ -289,6 +294,7 @@ class Learner:
         kl = jnp.where(looking, self.config.kl_target, losses["kl_last"])
         new_state = TrainState(
             params=params,
+            average=self._averaged(state, params.policy),
             opt_state=opt_state,
             guide_opt_state=guide_opt_state,
             learning_rate=adapt_learning_rate(state.learning_rate, kl, self.config),
@@ -298,6 +304,13 @@ class Learner:
             iteration=state.iteration + 1,
         )
         return new_state, {**env_metrics, **losses, "learning_rate": state.learning_rate}
+
+    def _averaged(self, state: TrainState, policy: Any) -> Any:
+        """The next average of the policy's parameters."""
+        # At the start it follows fast: an average from before a policy has learnt anything is of no use.
+        n = state.iteration.astype(jnp.float32)
+        keep = jnp.minimum(self.config.average, (1.0 + n) / (10.0 + n))
+        return jax.tree.map(lambda old, new: keep * old + (1.0 - keep) * new, state.average, policy)
 
     def _rollout(
         self, constants: list[jax.Array], state: TrainState, key: jax.Array

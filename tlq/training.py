@@ -167,7 +167,7 @@ def export(config: TrainConfig, state: TrainState, env_steps: int) -> None:
     from tlq.export import export_policy
 
     path = Path(config.run) / "policy.npz"
-    export_policy(path, config, state.params.policy, state.normaliser, {"env_steps": env_steps})
+    export_policy(path, config, state.average, state.normaliser, {"env_steps": env_steps})
 
 
 def save_failed(config: TrainConfig, learner: Learner, before: TrainState, iteration: int) -> str:
@@ -208,6 +208,9 @@ def initialise(state: TrainState, source: str, config: TrainConfig | None = None
     path, before = Path(source), None
     if path.is_dir():
         arrays = read_arrays(path / "checkpoints" if (path / "checkpoints").is_dir() else path)
+        # What the run's policy.npz has, too.
+        average = {f"params.policy.{n.removeprefix('average.')}": n for n in arrays if n.startswith("average.")}
+        arrays |= {name: arrays[n] for name, n in average.items()}
         if (path / "config.yaml").is_file():
             before = load_config(path / "config.yaml").env
     else:
@@ -255,7 +258,11 @@ def initialise(state: TrainState, source: str, config: TrainConfig | None = None
     if config is not None and config.ppo.kl_target > 0:
         rate = jax.device_put(np.float32(config.ppo.learning_rate_min), rate.sharding)
     return dataclasses.replace(
-        state, params=parts["params"], normaliser=parts["normaliser"], learning_rate=rate
+        state,
+        params=parts["params"],
+        average=parts["params"].policy,
+        normaliser=parts["normaliser"],
+        learning_rate=rate,
     )
 
 

@@ -131,6 +131,7 @@ def test_training_starts_from_a_file(file, made, capsys):
     @flax.struct.dataclass
     class Start:
         params: object
+        average: object
         normaliser: object
         learning_rate: object
 
@@ -139,8 +140,9 @@ def test_training_starts_from_a_file(file, made, capsys):
         policy: object
 
     zeros = jax.tree.map(jnp.zeros_like, (made.params, made.normaliser))
-    state = initialise(Start(Params(zeros[0]), zeros[1], jnp.float32(0.0)), str(file))
-    jax.tree.map(np.testing.assert_array_equal, state.params.policy, made.params)
+    state = initialise(Start(Params(zeros[0]), zeros[0], zeros[1], jnp.float32(0.0)), str(file))
+    for learnt in (state.params.policy, state.average):
+        jax.tree.map(np.testing.assert_array_equal, learnt, made.params)
     np.testing.assert_array_equal(state.normaliser.std["state"], made.normaliser.std["state"])
 
 

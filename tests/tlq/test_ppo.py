@@ -125,6 +125,17 @@ def test_the_first_iteration_only_looks(learner):
     assert any(jax.tree.leaves(changed))
 
 
+def test_the_policys_parameters_are_averaged(learner):
+    state = learner.init(1)
+    jax.tree.map(np.testing.assert_array_equal, state.average, state.params.policy)
+    for n in range(4):
+        before, (state, _) = state, learner.step(state)
+        # 1/10, 2/11, ... of the old average are kept at first, up to `average`.
+        keep = min(learner.config.average, (1 + n) / (10 + n))
+        expected = jax.tree.map(lambda a, p: keep * a + (1 - keep) * p, before.average, state.params.policy)
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-6), state.average, expected)
+
+
 def test_the_same_seed_gives_the_same_run_and_another_one_another(learner, trained):
     state = learner.init(0)
     for _ in range(3):

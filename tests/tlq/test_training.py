@@ -182,8 +182,12 @@ def test_a_run_can_start_from_another_ones_parameters(run, learner, tmp_path):
     arrays = read_arrays(tmp_path / "run/checkpoints")
     state = initialise(learner.init(7), str(tmp_path / "run"))
     for name, x in zip(names(state), jax.tree.leaves(state), strict=True):
-        if name.startswith(("params", "normaliser")):
-            np.testing.assert_array_equal(x, arrays[name], err_msg=name)
+        if name.startswith(("params", "normaliser", "average")):
+            # The policy's parameters are the averaged ones, as in the run's policy file.
+            taken = name.replace("params.policy", "average") if name.startswith("params") else name
+            np.testing.assert_array_equal(x, arrays[taken], err_msg=name)
+    changed = [n for n in arrays if n.startswith("params.policy")]
+    assert any((arrays[n] != arrays[n.replace("params.policy", "average")]).any() for n in changed)
     assert int(state.iteration) == 0
     # Where the KL steers the learning rate it starts low, else as it is set.
     for target, rate in ((0.01, 2e-5), (0.0, 1e-3)):
@@ -238,7 +242,7 @@ def started(head, file):
     networks = make_networks(ToyEnv().observation_size, 14, config=config)
     params = PPONetworkParams(networks.policy_network.init(jax.random.PRNGKey(1)), {})
     normaliser = init_state({name: jnp.zeros(n) for name, n in ToyEnv().observation_size.items()})
-    state = TrainState(params, (), (), 0.0, normaliser, None, None, 0)
+    state = TrainState(params, params.policy, (), (), 0.0, normaliser, None, None, 0)
     return params.policy["params"], initialise(state, str(file)).params.policy["params"]
 
 
