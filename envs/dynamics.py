@@ -1,10 +1,10 @@
 """The physics substep of a trunk with four legs of three hinges, as MJX computes it, but for nothing else.
 
 MJX treats any mechanism: under `jax.vmap` its substep is hundreds of gathers, scatters, small matrix products and
-18 x 18 factorisations. This robot's matrices have a shape that needs none of them. Every constraint, a joint's limit or
-a foot's contact, moves the trunk (6 degrees of freedom) and one leg (3) alone, so the mass matrix and the Newton solver's
-Hessian both are arrowheads: a block of 6 x 6, four of 3 x 3, and what couples each of these with the first. They are
-solved leg by leg (Featherstone 2008, Rigid Body Dynamics Algorithms, section 6.5: branches induce sparsity).
+18 x 18 factorisations. This robot's matrices have a shape that needs none of them. Every constraint, a joint's limit
+or a foot's contact, moves the trunk (6 degrees of freedom) and one leg (3) alone, so the mass matrix and the Newton
+solver's Hessian both are arrowheads: a block of 6 x 6, four of 3 x 3, and what couples each of these with the first.
+They are solved leg by leg (Featherstone 2008, Rigid Body Dynamics Algorithms, section 6.5: branches induce sparsity).
 
 The batch is the last axis of every array, along which a processor's vector units work: (..., L, B). What is small is
 written out by components (`envs.algebra`), all in one frame T: the trunk's axes at its origin. Velocities of the trunk,
@@ -893,11 +893,11 @@ def _batched(function: Any) -> Any:
 
     @single.def_vmap
     def many(size: int, batched: Any, *args: jax.Array) -> Any:
-        last = (jnp.moveaxis(x, 0, -1) if b else x[..., None] for x, b in zip(args, batched, strict=True))
-        found = function(*last)
-        return jax.tree.map(
-            lambda x: jnp.moveaxis(jnp.broadcast_to(x, (*x.shape[:-1], size)), -1, 0), found
-        ), jax.tree.map(lambda _: True, found)
+        def last(x: jax.Array, is_batched: bool) -> jax.Array:
+            return jnp.moveaxis(x, 0, -1) if is_batched else jnp.broadcast_to(x[..., None], (*x.shape, size))
+
+        found = function(*(last(x, b) for x, b in zip(args, batched, strict=True)))
+        return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), found), jax.tree.map(lambda _: True, found)
 
     return single
 

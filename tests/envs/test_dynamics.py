@@ -17,7 +17,7 @@ TILTS = np.array([[0, 0, 1], [0.6, 0, 0.8]], np.float32)
 
 
 def make(name, num_planes=1):
-    """Model, record of the robot and the planes' ids; "random": bodies turned and weighed at random, each its own way."""
+    """Model, record of the robot and the planes' ids; "random": every body turned and weighed in a way of its own."""
     model, robot = physics.physics_model(RobotConfig("max" if name == "random" else name), 0.005, num_planes)
     if name == "random":
         rng = np.random.default_rng(5)
