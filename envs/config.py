@@ -13,6 +13,9 @@ EVALUATION_ITERATIONS = 4
 METHODS = ("ours", "fixed_height", "blind")
 """The paper's method and its two baselines."""
 
+DYNAMICS = ("tree", "mjx")
+"""Implementations of the physics substep."""
+
 
 @dataclasses.dataclass(frozen=True)
 class RandomisationConfig:
@@ -96,6 +99,9 @@ class EnvConfig:
     """Control period (s): the policy runs at 50 Hz."""
     physics_dt: float = 0.005
     """Physics timestep (s)."""
+    dynamics: str = "tree"
+    """tree (the substep written for a trunk with four legs) or mjx (the same by MJX, which also computes what the
+    former doesn't cover, such as `robot.joint_friction`)."""
     solver_iterations: int = 2
     """Newton iterations of the constraint solver. With one, a robot on blocks falls where it would not
     (docs/physics.md); evaluation takes `EVALUATION_ITERATIONS`."""

@@ -5,6 +5,7 @@ Letters: L = 4 legs (LF, RF, LR, RR), J = 12 joints, P = 25 sample points a foot
 
 import dataclasses
 import functools
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +17,8 @@ import rewards
 import terrains
 import tg
 from envs import physics
-from envs.config import METHODS, EnvConfig
+from envs.config import DYNAMICS, METHODS, EnvConfig
+from envs.dynamics import TreeDynamics, not_covered
 from envs.limits import check_limits
 from envs.robot import ROBOTS, Robot
 from envs.types import Episode, Randomised
@@ -45,6 +47,7 @@ class QuadrupedEnv(Env):
         self._model = mjx.put_model(self.mj_model)
         self._data = mjx.make_data(self._model)
         self._planes = physics.plane_ids(self.mj_model, config.num_planes)
+        self._tree = self._make_tree()
         self._near = tg.samples.within(config.rewards.terrain_ring)
         self._instances, self._counts = self._by_kind()
 
@@ -414,21 +417,12 @@ class QuadrupedEnv(Env):
     def _simulate(self, episode: Episode, desired: jax.Array) -> Episode:
         """Physics over one control period, joints under PD control."""
         c, r = self.config, episode.randomised
-        model = self._model
-        if c.randomisation.enabled:
-            trunk = self.robot.trunk_id
-            model = model.replace(
-                body_mass=model.body_mass.at[trunk].add(r.payload),
-                pair_friction=model.pair_friction.at[:, :2].set(r.friction),
-            )
         contact = functools.partial(
             terrains.contact, self.bank, episode.terrain, floor=episode.floor, num_planes=c.num_planes
         )
         # Not `split`: its second key is fold_in(key, 1), which is the sensors' noise.
         key, key_push = jax.random.fold_in(episode.key, 0), jax.random.fold_in(episode.key, 4)
-        data = self._data.replace(
-            qpos=episode.qpos, qvel=episode.qvel + self._push(key_push), qacc_warmstart=episode.warmstart
-        )
+        substep = self._substep(r, contact)
         kp, kd = c.robot.kp * r.kp_factor, c.robot.kd * r.kd_factor
         limit = self.robot.torque_limit
 
@@ -436,21 +430,44 @@ class QuadrupedEnv(Env):
             qpos, qvel, warmstart, _ = carry
             followed = jnp.where(i < r.latency, episode.controller.desired, desired)
             torque = jnp.clip(kp * (followed - qpos[7:]) - kd * qvel[6:], -limit, limit)
-            now = data.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart)
-            now = physics.substep(
-                model,
-                now,
-                self._planes,
-                self.robot.foot_geom_ids,
-                contact,
-                jnp.concatenate([jnp.zeros(6), torque]),
-                c.solver_iterations,
-            )
-            return (now.qpos, now.qvel, now.qacc_warmstart, torque), None
+            force = jnp.concatenate([jnp.zeros(6), torque])
+            return (*substep(qpos, qvel, warmstart, force), torque), None
 
-        start = (data.qpos, data.qvel, data.qacc_warmstart, episode.torque)
+        start = (episode.qpos, episode.qvel + self._push(key_push), episode.warmstart, episode.torque)
         (qpos, qvel, warmstart, torque), _ = jax.lax.scan(one, start, jnp.arange(self.substeps))
         return episode.replace(qpos=qpos, qvel=qvel, warmstart=warmstart, torque=torque, key=key)
+
+    def _make_tree(self) -> TreeDynamics | None:
+        """The substep for this robot alone, None where MJX is wanted or has to do."""
+        feet = self.robot.foot_geom_ids
+        if self.config.dynamics == "mjx" or not_covered(self.mj_model, self._planes, feet):
+            return None
+        return TreeDynamics(self.mj_model, self._planes, feet)
+
+    def _substep(self, r: Randomised, contact: physics.Contact) -> Callable[..., tuple[jax.Array, ...]]:
+        """A timestep as a function of qpos, qvel, warmstart and generalised force that returns the first three."""
+        iterations, model = self.config.solver_iterations, self._model
+        drawn = self.config.randomisation.enabled
+        if self._tree is not None:
+            payload, friction = (r.payload, r.friction) if drawn else (0.0, None)
+            return functools.partial(
+                self._tree.substep, contact=contact, iterations=iterations, payload=payload, friction=friction
+            )
+        if drawn:
+            model = model.replace(
+                body_mass=model.body_mass.at[self.robot.trunk_id].add(r.payload),
+                pair_friction=model.pair_friction.at[:, :2].set(r.friction),
+            )
+
+        def substep(
+            qpos: jax.Array, qvel: jax.Array, warmstart: jax.Array, qfrc: jax.Array
+        ) -> tuple[jax.Array, ...]:
+            data = self._data.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart)
+            feet = self.robot.foot_geom_ids
+            data = physics.substep(model, data, self._planes, feet, contact, qfrc, iterations)
+            return data.qpos, data.qvel, data.qacc_warmstart
+
+        return substep
 
     def _push(self, key: jax.Array) -> jax.Array:
         """A change of velocity (18,), zero at most steps."""
@@ -581,6 +598,8 @@ def check(config: EnvConfig) -> None:
     """Raises ValueError on a configuration that makes no sense."""
     if config.method not in METHODS:
         raise ValueError(f"unknown method '{config.method}'; choose one of {', '.join(METHODS)}")
+    if config.dynamics not in DYNAMICS:
+        raise ValueError(f"unknown dynamics '{config.dynamics}'; choose one of {', '.join(DYNAMICS)}")
     check_limits(config)
     ratio = config.control_dt / config.physics_dt
     if abs(ratio - round(ratio)) > 1e-6 or ratio < 1:

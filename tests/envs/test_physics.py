@@ -10,6 +10,8 @@ import pytest
 from mujoco import mjx
 
 from envs import EVALUATION_ITERATIONS, EnvConfig, RobotConfig, physics
+from envs.config import DYNAMICS
+from envs.dynamics import TreeDynamics
 from envs.robot import ROBOTS, make_robot
 from envs.scene import build_scene
 
@@ -26,13 +28,14 @@ def ground(num_planes, centre):
 
 
 class Rig:
-    """The robot on level ground under PD control, in MJX."""
+    """The robot on level ground under PD control."""
 
     def __init__(self):
         self.host, self.robot = physics.physics_model(MAX, 0.005, 1)
         self.model = mjx.put_model(self.host)
         self.empty = mjx.make_data(self.model)
         self.planes = physics.plane_ids(self.host, 1)
+        self.tree = TreeDynamics(self.host, self.planes, self.robot.foot_geom_ids)
         self.settled = physics.settle(self.host, self.robot, self.robot.default_pose)
 
     def torque(self, qpos, qvel):
@@ -44,8 +47,17 @@ class Rig:
         contact, feet = functools.partial(ground, 1), self.robot.foot_geom_ids
         return physics.substep(self.model, data, self.planes, feet, contact, force, iterations)
 
-    def run(self, iterations, qpos, qvel):
+    def run(self, iterations, dynamics, qpos, qvel):
         """(T, 19) and (T, 18)."""
+
+        def by_tree(now, _):
+            qpos, qvel, warmstart = now
+            force = jnp.concatenate([jnp.zeros(6), self.torque(qpos, qvel)])
+            now = self.tree.substep(qpos, qvel, warmstart, force, functools.partial(ground, 1), iterations)
+            return now, now[:2]
+
+        if dynamics == "tree":
+            return jax.lax.scan(by_tree, (qpos, qvel, jnp.zeros(18)), length=STEPS)[1]
 
         def one(data, _):
             force = jnp.concatenate([jnp.zeros(6), self.torque(data.qpos, data.qvel)])
@@ -87,6 +99,7 @@ def mujoco_runs(rig, qpos, qvel):
     return np.array(found)
 
 
+@pytest.mark.parametrize("dynamics", DYNAMICS)
 @pytest.mark.parametrize(
     "iterations, position, speed",
     [
@@ -100,9 +113,9 @@ def mujoco_runs(rig, qpos, qvel):
         ),
     ],
 )
-def test_the_robot_moves_as_in_mujoco(rig, iterations, position, speed):
+def test_the_robot_moves_as_in_mujoco(rig, dynamics, iterations, position, speed):
     qpos, qvel = starts(rig.settled)
-    run = jax.jit(jax.vmap(functools.partial(rig.run, iterations)))
+    run = jax.jit(jax.vmap(functools.partial(rig.run, iterations, dynamics)))
     q, v = (np.asarray(part, np.float64) for part in run(qpos, qvel))
     reference = mujoco_runs(rig, qpos, qvel)
     away = np.linalg.norm(q[..., :3] - reference[..., :3], axis=-1).max(axis=1)

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 import envs
-from envs import physics
 from envs.env import exact_sensors
 from tests.envs.subjects import change, change_episode, standing
 
@@ -136,9 +135,9 @@ def test_pushes_come_as_often_and_as_hard_as_they_should(noisy):
 
 def test_a_push_doesnt_show_in_the_noise(noisy, monkeypatch):
     """Push and noise of a step come from different keys: the noise mustn't tell where the push goes."""
-    monkeypatch.setattr(physics, "substep", lambda model, data, *others: data)
     episode = change_episode(noisy.state.pipeline_state, qpos=standing(noisy.env), qvel=np.zeros(18))
     env = variant(noisy, push_interval=0.02)  # at every step
+    monkeypatch.setattr(env._tree, "substep", lambda qpos, qvel, warmstart, *_, **__: (qpos, qvel, warmstart))
 
     def both(key):
         now = episode.replace(key=key)
