@@ -237,7 +237,7 @@ class Problem(NamedTuple):
 
     def transposed(self, f: jax.Array) -> Joints:
         """Jᵀ f."""
-        trunk, legs = 0.0, self.limits.sign * f[-3:]
+        trunk, legs = jnp.zeros((6, f.shape[-1])), self.limits.sign * f[-3:]
         for i, c in enumerate(self.contacts):
             a, b, p, q = f[4 * i : 4 * i + 4]
             along = jnp.stack([a + b + p + q, self.mu * (a - b), self.mu * (p - q)])
@@ -300,6 +300,9 @@ def newton(
     return moved(x, alpha, step), moved(mx, alpha, m_step), residual + alpha * slope
 
 
+Three = tuple[jax.Array, jax.Array, jax.Array]
+
+
 class Points(NamedTuple):
     """The cost at P places along a line, and its derivatives, (P, B) each."""
 
@@ -329,9 +332,7 @@ def line_search(
     """
 
     def at(alpha: jax.Array) -> Points:
-        def add_row(
-            sums: tuple[jax.Array, ...], row: tuple[jax.Array, ...]
-        ) -> tuple[tuple[jax.Array, ...], None]:
+        def add_row(sums: Three, row: Three) -> tuple[Three, None]:
             d, r, s = row
             x = r + alpha[:, None] * s
             force = d * jnp.minimum(x, 0.0)
@@ -446,8 +447,8 @@ def shifted(mass: Component, centre: Vector, matrix: Symmetric) -> Inertia:
 
 def turned(frame: Matrix, s: Symmetric) -> Symmetric:
     """F s Fᵀ."""
-    rows = algebra.compose(frame, tuple(symmetric_apply(s, e) for e in algebra.IDENTITY))
-    return algebra.outer_sum(rows, frame)
+    x, y, z = (symmetric_apply(s, e) for e in algebra.IDENTITY)
+    return algebra.outer_sum(algebra.compose(frame, (x, y, z)), frame)
 
 
 def _matrices(quaternions: np.ndarray) -> np.ndarray:
@@ -523,7 +524,7 @@ class TreeDynamics:
         if reason:
             raise ValueError(reason)
         self.timestep = float(model.opt.timestep)
-        self.gravity = tuple(map(float, model.opt.gravity))
+        self.gravity = columns(model.opt.gravity[None])
         self.ls_iterations = int(model.opt.ls_iterations)
         self.tolerance = float(model.opt.tolerance * model.opt.ls_tolerance)
         self.impratio = float(model.opt.impratio)
@@ -539,7 +540,7 @@ class TreeDynamics:
         self.trunk_mass = float(model.body_mass[trunk])
         matrix = turn @ np.diag(model.body_inertia[trunk]) @ turn.T
         self.trunk_matrix = algebra.symmetric(matrix.tolist())
-        self.trunk_centre = tuple(map(float, model.body_ipos[trunk]))
+        self.trunk_centre = columns(model.body_ipos[trunk][None])
 
     def _read_links(self, model: mujoco.MjModel, bodies: np.ndarray, feet: np.ndarray) -> None:
         """Each link in a frame of its own, at its joint's anchor and with the joint's axis as x; links first."""
