@@ -131,7 +131,9 @@ def test_a_substep_is_mjxs(name, num_planes, iterations):
         jax.tree.map(np.asarray, jax.jit(jax.vmap(how(model, robot, planes, iterations)))(*given))
         for how in (by_tree, by_mjx)
     )
-    for found, expected, tolerance in zip(ours, theirs, (1e-6, 5e-5, 1e-4), strict=True):
+    # In double precision they agree to 5e-8. In single precision either is up to 3e-5 off where limits and contacts are
+    # hit hard, and positions by 5 ms of such an error in speeds.
+    for found, expected, tolerance in zip(ours, theirs, (5e-6, 5e-5, 1e-4), strict=True):
         assert np.isfinite(found).all()
         size = 1.0 + np.abs(expected).max(axis=1, keepdims=True)
         assert (np.abs(found - expected) / size).max() < tolerance
