@@ -168,7 +168,17 @@ class Learner:
         )
         self._loss = functools.partial(ppo_loss, networks=networks, config=config, axis=AXIS)
         self._foothold_loss = functools.partial(foothold_loss, networks=networks)
-        specs: list[Any] = [P(), P(), P(), P(), P(), P(), P(AXIS), P(), P()]  # only the environments are split
+        specs: list[Any] = [
+            P(),
+            P(),
+            P(),
+            P(),
+            P(),
+            P(),
+            P(AXIS),
+            P(),
+            P(),
+        ]  # only the environments are split
         self.specs = TrainState(*specs)
         self._hoist()
         # Nothing is donated: the state before an update stays whole, so that a failed one can be saved and replayed.

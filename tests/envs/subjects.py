@@ -17,7 +17,8 @@ def config(randomised=True, **changes):
     terrain = terrains.TerrainConfig(kind="mixed", num_terrains=24, half_extent=2.0)
     randomisation = envs.RandomisationConfig(enabled=randomised)
     return dataclasses.replace(
-        envs.EnvConfig(terrain=terrain, randomisation=randomisation, stand_share=0.0, stop_share=0.0), **changes
+        envs.EnvConfig(terrain=terrain, randomisation=randomisation, stand_share=0.0, stop_share=0.0),
+        **changes,
     )
 
 

@@ -132,7 +132,7 @@ def test_the_policys_parameters_are_averaged(learner):
         before, (state, _) = state, learner.step(state)
         # 1/10, 2/11, ... of the old average are kept at first, up to `average`.
         keep = min(learner.config.average, (1 + n) / (10 + n))
-        expected = jax.tree.map(lambda a, p: keep * a + (1 - keep) * p, before.average, state.params.policy)
+        expected = jax.tree.map(lambda a, p, k=keep: k * a + (1 - k) * p, before.average, state.params.policy)
         jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-6), state.average, expected)
 
 
