@@ -100,6 +100,16 @@ def test_a_branched_simulation_goes_on_as_the_first_one(tmp_path):
 
 
 @pytest.mark.slow
+def test_dynamics(tmp_path):
+    found = result("dynamics", ["num_envs=8", "num_terrains=12", "steps=2", "rounds=1"], tmp_path)
+    both = {f"{part}/{name}" for part in ("physics", "environment") for name in ("mjx", "tree")}
+    assert found["steps_per_second"].keys() == found["compile_seconds"].keys() == both
+    rates = found["steps_per_second"]
+    for part, ratio in found["mjx_vs_tree"].items():
+        assert ratio == pytest.approx(rates[f"{part}/tree"] / rates[f"{part}/mjx"])
+
+
+@pytest.mark.slow
 def test_perception(tmp_path):
     picture = tmp_path / "curves.png"
     arguments = [

@@ -168,18 +168,9 @@ class Learner:
         )
         self._loss = functools.partial(ppo_loss, networks=networks, config=config, axis=AXIS)
         self._foothold_loss = functools.partial(foothold_loss, networks=networks)
-        specs: list[Any] = [
-            P(),
-            P(),
-            P(),
-            P(),
-            P(),
-            P(),
-            P(AXIS),
-            P(),
-            P(),
-        ]  # only the environments are split
-        self.specs = TrainState(*specs)
+        split = {"env_state": P(AXIS)}  # and nothing else
+        fields = dataclasses.fields(TrainState)
+        self.specs = TrainState(**{f.name: split.get(f.name, P()) for f in fields})  # type: ignore[arg-type]
         self._hoist()
         # Nothing is donated: the state before an update stays whole, so that a failed one can be saved and replayed.
         # That costs one env_state; the rollout, which is ten times larger, lives inside the call.

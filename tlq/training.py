@@ -209,10 +209,8 @@ def initialise(state: TrainState, source: str, config: TrainConfig | None = None
     if path.is_dir():
         arrays = read_arrays(path / "checkpoints" if (path / "checkpoints").is_dir() else path)
         # What the run's policy.npz has, too.
-        average = {
-            f"params.policy.{n.removeprefix('average.')}": n for n in arrays if n.startswith("average.")
-        }
-        arrays |= {name: arrays[n] for name, n in average.items()}
+        averaged = {n.removeprefix("average."): x for n, x in arrays.items() if n.startswith("average.")}
+        arrays |= {f"params.policy.{name}": x for name, x in averaged.items()}
         if (path / "config.yaml").is_file():
             before = load_config(path / "config.yaml").env
     else:
