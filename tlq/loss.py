@@ -48,9 +48,11 @@ def ppo_loss(
       The loss (), and its parts.
     """
     distribution = networks.parametric_action_distribution
-    parameters = networks.policy_network.apply(
-        normaliser, without_gradient(params.policy), dict(rollout.observation, carry=carry[None])
-    )
+    observation: dict[str, Any] = dict(rollout.observation, carry=carry[None])
+    if networks.footholds is not None:
+        # To PPO the footholds are part of the world: their parameters stay as they acted and get no gradient.
+        observation["footholds"] = rollout.footholds
+    parameters = networks.policy_network.apply(normaliser, params.policy, observation)
     values = networks.value_network.apply(normaliser, params.value, rollout.observation)
     last_value = networks.value_network.apply(normaliser, params.value, {"privileged_state": last})
     targets, advantages = compute_gae(
@@ -78,7 +80,7 @@ def ppo_loss(
         guide_loss = jnp.mean(guide.cost(rollout.guide, mean))
     taken_over = jnp.float32(0)
     if networks.footholds is not None:
-        squares = jnp.square(parameters["share"] * parameters["rest"])
+        squares = jnp.square(parameters["footholds"]["share"] * parameters["footholds"]["rest"])
         taken_over = jnp.mean(jnp.sum(squares, axis=-1))
     total = (
         policy_loss + value_loss + entropy_loss + config.guide * guide_loss + config.taken_over * taken_over
@@ -97,14 +99,6 @@ def ppo_loss(
         "std": jnp.mean(new.scale),
         "std_max": jnp.max(new.scale),
     }
-
-
-def without_gradient(policy: Any) -> Any:
-    """A policy's parameters of which those of the footholds get no gradient: to PPO they are part of the world."""
-    parts = policy["params"]
-    if "footholds" not in parts:
-        return policy
-    return {"params": dict(parts, footholds=jax.lax.stop_gradient(parts["footholds"]))}
 
 
 def foothold_loss(

@@ -127,11 +127,16 @@ UNLED = -2.0
 """Logit of the share that an untrained part for footholds has in the residuals."""
 
 
+def _elu(x: jax.Array) -> jax.Array:
+    """ELU (arXiv 1511.07289) to within rounding; on a CPU `expm1`, which `nn.elu` calls, takes longer than `exp`."""
+    return jnp.maximum(x, 0.0) + jnp.exp(jnp.minimum(x, 0.0)) - 1.0
+
+
 def _feet(c: NetworkConfig, heights: jax.Array) -> jax.Array:
     """Layers of the module that calls it: heights (.., 100) to what each foot sees (.., 4, F), weights shared."""
     foot = heights[..., SAME_SIDE].reshape(*heights.shape[:-1], c.feet, heights.shape[-1] // c.feet)
     for i, width in enumerate(c.foot_encoder):
-        foot = nn.elu(Dense(width, name=f"foot_{i}")(foot))
+        foot = _elu(Dense(width, name=f"foot_{i}")(foot))
     return foot
 
 
@@ -141,7 +146,7 @@ def _legs(c: NetworkConfig, width: int, foot: jax.Array, context: jax.Array) -> 
     """
     context = Dense(c.feet * c.leg_context, name="to_legs")(context)
     context = context.reshape(*foot.shape[:-1], c.leg_context)
-    leg = nn.elu(Dense(width, name="leg")(jnp.concatenate([foot, context], axis=-1)))
+    leg = _elu(Dense(width, name="leg")(jnp.concatenate([foot, context], axis=-1)))
     residuals = Dense(3, kernel_init=SMALL, name="leg_action")(leg) * LEG_SIGN
     return residuals.reshape(*leg.shape[:-2], 3 * c.feet), leg
 
@@ -157,22 +162,24 @@ class Footholds(nn.Module):
     config: NetworkConfig
 
     @nn.compact
-    def __call__(
-        self, proprio: jax.Array, heights: jax.Array, rest: jax.Array
-    ) -> tuple[jax.Array, jax.Array]:
-        """Normalised proprio (.., S - 100), heights (.., 100), rest (.., 12): the rest's residual actions before tanh.
-
-        Returns what is to be added to those (.., 12), and the shares g (.., 12).
+    def __call__(self, proprio: jax.Array, heights: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Normalised proprio (.., S - 100), heights (.., 100) -> its own residual actions (.., 12) before tanh, and the
+        shares g (.., 12).
         """
         c = self.config
         foot = _feet(c, heights)
         # A trot swings a leg together with the one across.
         pair = jnp.concatenate([foot, foot[..., ::-1, :]], axis=-1)
-        context = nn.elu(Dense(c.foothold_head, name="proprio")(proprio))
+        context = _elu(Dense(c.foothold_head, name="proprio")(proprio))
         own, leg = _legs(c, c.foothold_head, pair, context)
         share = Dense(3, kernel_init=SMALL, bias_init=nn.initializers.constant(UNLED), name="share")(leg)
         share = nn.sigmoid(share.reshape(own.shape))
-        return share * (own - rest), share
+        return own, share
+
+
+def _added(own: jax.Array, share: jax.Array, rest: jax.Array) -> jax.Array:
+    """What `Footholds` add to the rest's residual actions before tanh; all (.., 12)."""
+    return share * (own - rest)
 
 
 class Policy(nn.Module):
@@ -183,26 +190,32 @@ class Policy(nn.Module):
 
     @nn.compact
     def __call__(
-        self, proprio: jax.Array, heights: jax.Array | None, carry: jax.Array, is_first: jax.Array
-    ) -> dict[str, jax.Array]:
+        self,
+        proprio: jax.Array,
+        heights: jax.Array | None,
+        carry: jax.Array,
+        is_first: jax.Array,
+        footholds: dict[str, jax.Array] | None = None,
+    ) -> dict[str, Any]:
         """proprio (.., S - 100), heights (.., 100) or None, carry (B, C) from before the first step, is_first (.., 1);
         .. is (B,) for a step, (T, B) for a scan.
 
-        Returns {'action': (.., 2 A), 'carry': (B, C) after the last step}, and with a part for footholds 'rest':
-        (.., 12), the residuals' means without it, and 'share': (.., 12), how much of them it takes over.
+        Returns {'action': (.., 2 A), 'carry': (B, C) after the last step}, and with a part for footholds 'footholds':
+        'rest' (.., 12), the residuals' means without it, 'own' (.., 12), its own, and 'share' (.., 12), how much of
+        them it takes over. With `footholds` of an earlier call 'own' and 'share' are taken from there.
         """
         c = self.config
-        x = nn.elu(Dense(c.encoder, name="proprio")(proprio))
+        x = _elu(Dense(c.encoder, name="proprio")(proprio))
         foot = None
         if heights is not None:
             foot = _feet(c, heights)
             # The feet are told apart here: each has its own place in the input of `mix`.
             x = jnp.concatenate([x, foot.reshape(*x.shape[:-1], -1)], axis=-1)
-        x = nn.elu(Dense(c.encoder, name="mix")(x))
+        x = _elu(Dense(c.encoder, name="mix")(x))
         y = Dense(c.memory_width, name="to_memory")(x)
         carry, y = Memory(c.memory, c.memory_layers, c.memory_width, name="memory")(carry, y, is_first)
         # x skips the memory, so that reflexes don't have to pass through it.
-        y = nn.elu(Dense(c.head, name="head")(jnp.concatenate([x, y], axis=-1)))
+        y = _elu(Dense(c.head, name="head")(jnp.concatenate([x, y], axis=-1)))
         out = Dense(
             2 * self.action_size,
             kernel_init=SMALL,
@@ -215,8 +228,15 @@ class Policy(nn.Module):
         if heights is None or not c.foothold_head:
             return {"action": action, "carry": carry}
         rest = action[..., RESIDUALS]
-        added, share = Footholds(c, name="footholds")(proprio, heights, rest)
-        return {"action": action.at[..., RESIDUALS].add(added), "carry": carry, "rest": rest, "share": share}
+        if footholds is None:
+            own, share = Footholds(c, name="footholds")(proprio, heights)
+        else:
+            own, share = footholds["own"], footholds["share"]
+        return {
+            "action": action.at[..., RESIDUALS].add(_added(own, share, rest)),
+            "carry": carry,
+            "footholds": {"rest": rest, "own": own, "share": share},
+        }
 
 
 class Critic(nn.Module):
@@ -229,7 +249,7 @@ class Critic(nn.Module):
         """(.., V) -> (..)."""
         x = privileged_state
         for i, width in enumerate(self.widths):
-            x = nn.elu(Dense(width, name=f"hidden_{i}")(x))
+            x = _elu(Dense(width, name=f"hidden_{i}")(x))
         return Dense(1, name="value")(x)[..., 0]
 
 
@@ -239,7 +259,10 @@ class Networks(PPONetworks):
 
     footholds: Callable[..., jax.Array] | None = None
     """(normaliser, its parameters, 'state' (.., S), the rest's residuals (.., 12) before tanh) -> (.., 12) what it adds
-    to them; None without."""
+    to them; None without.
+
+    The policy network takes an observation that has, as 'footholds', what they were in an earlier call.
+    """
 
 
 def _size(shape: Any) -> int:
@@ -282,7 +305,8 @@ def make_networks(
     def policy_apply(statistics: Any, params: Any, obs: dict[str, jax.Array]) -> dict[str, jax.Array]:
         proprio, _ = split(_normalised(preprocess_observations_fn, statistics, obs, "state"))
         carry = obs["carry"] if proprio.ndim == 2 else obs["carry"][0]
-        return policy.apply(params, proprio, split(obs["state"])[1], carry, obs["is_first"])
+        heights = split(obs["state"])[1]
+        return policy.apply(params, proprio, heights, carry, obs["is_first"], obs.get("footholds"))
 
     def value_apply(statistics: Any, params: Any, obs: dict[str, jax.Array]) -> jax.Array:
         return critic.apply(
@@ -291,7 +315,8 @@ def make_networks(
 
     def footholds_apply(statistics: Any, params: Any, state: jax.Array, rest: jax.Array) -> jax.Array:
         proprio, _ = split(_normalised(preprocess_observations_fn, statistics, {"state": state}, "state"))
-        return Footholds(config).apply({"params": params}, proprio, split(state)[1], rest)[0]
+        own, share = Footholds(config).apply({"params": params}, proprio, split(state)[1])
+        return _added(own, share, rest)
 
     return Networks(
         footholds=footholds_apply if heights and config.foothold_head else None,

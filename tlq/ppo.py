@@ -112,7 +112,7 @@ class Rollout:
     done: jax.Array  # (T, B)
     truncation: jax.Array  # (T, B)
     guide: Guidance | None  # (T, B, ...) what a guide to footholds says, if there is one
-    rest: jax.Array | None  # (T, B, 12) the residuals' means but for the footholds' part, if there is one
+    footholds: dict[str, jax.Array] | None  # (T, B, 12) each, see `Policy`, if there is a part for them
 
 
 def make_mesh(num_devices: int = 0) -> Mesh:
@@ -209,7 +209,8 @@ class Learner:
         parts = {name: part for name, part in parts.items() if part is not None}
         observation, guidance = parts.pop("observation"), parts.pop("guide", None)
         guidance = {f"guide_{k}": x for k, x in guidance._asdict().items()} if guidance else {}
-        return parts | observation | guidance | {"carry": carry, "last": last}
+        footholds = {f"footholds_{k}": x for k, x in parts.pop("footholds", {}).items()}
+        return parts | observation | guidance | footholds | {"carry": carry, "last": last}
 
     # -- state ---------------------------------------------------------------------------------------------------------
 
@@ -334,7 +335,7 @@ class Learner:
                 done=after.done,
                 truncation=after.info["truncation"],
                 guide=env_state.info.get("guide"),
-                rest=parameters.get("rest"),
+                footholds=parameters.get("footholds"),
             )
             metrics = {k: jnp.mean(v) for k, v in after.metrics.items()}
             return after, (rollout, dict(metrics, reward=jnp.mean(after.reward)))
@@ -415,7 +416,8 @@ class Learner:
         Returns their parameters, their optimiser's state, and the mean cost () in the last pass.
         """
         c, footholds = self.config, state.params.policy["params"]["footholds"]
-        data = rollout.observation["state"], rollout.rest, rollout.guide
+        assert rollout.footholds is not None
+        data = rollout.observation["state"], rollout.footholds["rest"], rollout.guide
         stride = math.gcd(STRIDE, c.unroll)
         chosen = jnp.repeat(self._minibatches(key, c.guide_epochs), stride, axis=0)
         first = jnp.arange(len(chosen)) % stride

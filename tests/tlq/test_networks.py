@@ -181,20 +181,25 @@ def test_footholds_take_over_a_share_of_the_residuals():
     plain = make_networks({"state": 110, "privileged_state": 20}, 14, config=without)
     both = networks.policy_network.apply(stats, params, obs)
     rest = plain.policy_network.apply(stats, params, obs)["action"]
-    np.testing.assert_allclose(both["rest"], rest[..., 2:14], atol=1e-6)
-    added = networks.footholds(stats, own, obs["state"], both["rest"])
+    found = both["footholds"]
+    np.testing.assert_allclose(found["rest"], rest[..., 2:14], atol=1e-6)
+    added = networks.footholds(stats, own, obs["state"], found["rest"])
     assert float(jnp.abs(added).max()) > 0.01
     expected = np.array(rest)
     expected[..., 2:14] += added  # after frequency and lift; then the raw scales
     np.testing.assert_allclose(both["action"], expected, atol=1e-6)
     # Of whatever the rest does more, a share is taken back: it is replaced, not added to.
-    share = added - networks.footholds(stats, own, obs["state"], both["rest"] + 1.0)
+    share = added - networks.footholds(stats, own, obs["state"], found["rest"] + 1.0)
     assert ((share > 0) & (share < 1)).all()
-    np.testing.assert_allclose(both["share"], share, atol=1e-5)
+    np.testing.assert_allclose(found["share"], share, atol=1e-5)
     alone = dict(own, share=jax.tree.map(jnp.zeros_like, own["share"]) | {"bias": jnp.full(3, 100.0)})
-    taken_over = [networks.footholds(stats, alone, obs["state"], r) + r for r in (both["rest"], 3.0)]
+    taken_over = [networks.footholds(stats, alone, obs["state"], r) + r for r in (found["rest"], 3.0)]
     np.testing.assert_allclose(*taken_over, atol=1e-5)
-    np.testing.assert_allclose(added, share * (taken_over[0] - both["rest"]), atol=1e-5)
+    np.testing.assert_allclose(added, share * (taken_over[0] - found["rest"]), atol=1e-5)
+    # What they were in an earlier call replaces the network, whose parameters then don't matter.
+    nothing = {"params": dict(params["params"], footholds=jax.tree.map(jnp.zeros_like, own))}
+    again = networks.policy_network.apply(stats, nothing, dict(obs, footholds=found))
+    np.testing.assert_allclose(again["action"], both["action"], atol=1e-6)
 
 
 def test_only_the_action_enters_the_density():

@@ -276,7 +276,15 @@ def test_residuals_that_footholds_take_over_cost_their_squares():
     carry, last = parts["carry"], parts["last"]
     observation = {name: parts[name] for name in ("state", "privileged_state", "is_first")}
     names = ("action", "log_prob", "parameters", "reward", "done", "truncation")
-    rollout = Rollout(observation=observation, guide=None, rest=None, **{name: parts[name] for name in names})
+    out = learner.networks.policy_network.apply(
+        state.normaliser, params.policy, dict(observation, carry=carry[None])
+    )
+    rollout = Rollout(
+        observation=observation,
+        guide=None,
+        footholds=out["footholds"],
+        **{name: parts[name] for name in names},
+    )
     keys = jax.random.split(jax.random.PRNGKey(0), B)
 
     def loss(params, weight):
@@ -285,9 +293,8 @@ def test_residuals_that_footholds_take_over_cost_their_squares():
         apart = jax.shard_map(whole, mesh=make_mesh(1), in_specs=P(), out_specs=P(), check_vma=False)
         return apart(params, state.normaliser, rollout, carry, last, keys)[0]
 
-    networks = learner.networks
-    out = networks.policy_network.apply(state.normaliser, params.policy, dict(observation, carry=carry[None]))
-    expected = np.mean(np.sum(np.square(np.array(out["share"]) * np.array(out["rest"])), axis=-1))
+    share, rest = (np.array(out["footholds"][name]) for name in ("share", "rest"))
+    expected = np.mean(np.sum(np.square(share * rest), axis=-1))
     assert expected > 1e-3
     both = jax.jit(jax.value_and_grad(loss))
     (paid, grads), (free, _) = both(params, jnp.float32(2.0)), both(params, jnp.float32(0.0))
