@@ -86,14 +86,14 @@ class Parts:
         """By name."""
         unroll = self.config.ppo.unroll
         steps = timing.env_steps(self.learner, unroll)
-        guided = "guide" in self.state.env_state.info
+        guided = self.learner.guided
         return {
             "iteration": lambda: self.learner.step(self.state),
             "environment": lambda: steps(self.state.env_state),
             "physics": self.physics(unroll),
             "contact look-ups": self.repeated(self.contacts, unroll * self.env.substeps),
             "height look-ups": self.repeated(self.heights, unroll * HEIGHT_LOOK_UPS),
-            **({"guide": self.repeated(self.guide, unroll)} if guided else {}),
+            **({"guide": self.repeated(self.guide, unroll // self.learner.stride)} if guided else {}),
             "policy": self.policy(unroll),
             "update": self.update(),
         }
@@ -163,7 +163,7 @@ class Parts:
         learner, s = self.learner, self.state
         over_time = P(None, AXIS)
         roll = self.jit(learner._rollout, (P(), learner.specs, P()), (P(AXIS), over_time, P()))
-        env_state, rollout, _ = roll(learner._step_constants, s, s.key)
+        env_state, rollout, _ = roll(learner._constants, s, s.key)
         compiled = self.jit(learner._update, (learner.specs, P(AXIS), over_time, P(AXIS), P()), P())
         carry, last = s.env_state.obs["carry"], env_state.obs["privileged_state"]
         return lambda: compiled(s, carry, rollout, last, s.key)

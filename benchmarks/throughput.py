@@ -64,7 +64,7 @@ class Options:
 class Environments:
     """Environments without the policy: a function that makes some steps.
 
-    guided: as in training, where they also compute what the scripted guide to footholds says.
+    guided: as in training, where a scripted guide to footholds is asked what it says.
     """
 
     def __init__(self, kind: str, num_envs: int, num_terrains: int, guided: bool = False):
@@ -186,7 +186,6 @@ def compare(options: Options) -> dict[str, Any]:
     found = rates(
         {
             "env": (plain.run, plain.steps),
-            "guided_env": (stones.run, stones.steps),
             "mujoco_c": (c.run, stones.steps),
             "training": (training, stones.learner.steps_per_iteration),
         },
@@ -195,7 +194,6 @@ def compare(options: Options) -> dict[str, Any]:
     return {
         "env_vs_mujoco_c": found["env"] / found["mujoco_c"],
         "training_vs_env": found["training"] / found["env"],
-        "training_vs_guided_env": found["training"] / found["guided_env"],
         "env_vs_playground": playground(options, found["env"]),
         "steps_per_second": found,
         **stones.sizes(),

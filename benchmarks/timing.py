@@ -51,7 +51,7 @@ def env_steps(learner: Learner, length: int) -> Callable[[State], State]:
     compiled = jax.jit(
         jax.shard_map(steps, mesh=learner.mesh, in_specs=(P(), P(AXIS)), out_specs=P(AXIS), check_vma=False)
     )
-    return lambda env_state: compiled(learner._step_constants, env_state)
+    return lambda env_state: compiled(learner._constants["step"], env_state)
 
 
 def put_out(result: dict[str, Any], settings: dict[str, Any], path: str) -> None:

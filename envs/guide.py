@@ -316,28 +316,32 @@ def idle(guidance: Guidance, added: jax.Array) -> jax.Array:
 
 
 class Guided(Wrapper):
-    """An environment whose state's info has, as 'guide', the `Guidance` for the next action.
+    """An environment with a method `guidance`, which says what the guide thinks of the next action.
 
-    And, as 'held' (4, 2) m, heading frame, where the feet are led by residual joint angles, smoothed; in stance, where
-    they were led when they came down.
+    Its state's info has, as 'held' (4, 2) m, heading frame, where the feet are led by residual joint angles, smoothed;
+    in stance, where they were led when they came down.
     """
 
     def __init__(self, env: Env):
         super().__init__(env)
 
-    def _with_guide(self, state: State, held: jax.Array) -> State:
+    def guidance(self, state: State) -> Guidance:
+        """Of a state's next action."""
+        return guide(cast(QuadrupedEnv, self.env.unwrapped), state.pipeline_state, state.info["held"])
+
+    def _with_held(self, state: State, held: jax.Array) -> State:
         env = cast(QuadrupedEnv, self.env.unwrapped)
         episode: Episode = state.pipeline_state
         controller = episode.controller
         now = env.core.residual_displacement(controller, exact_sensors(episode))[:, :2]
         swing = tg.path.leg_phases(controller.phase)[:, None] > 0
         held = jnp.where(state.done > 0, 0.0, jnp.where(swing, held + SMOOTHING * (now - held), held))
-        return state.replace(info=state.info | {"guide": guide(env, episode, held), "held": held})
+        return state.replace(info=state.info | {"held": held})
 
     def reset(self, key: jax.Array) -> State:
         """As the environment's."""
-        return self._with_guide(self.env.reset(key), jnp.zeros((4, 2)))
+        return self._with_held(self.env.reset(key), jnp.zeros((4, 2)))
 
     def step(self, state: State, action: jax.Array) -> State:
         """As the environment's."""
-        return self._with_guide(self.env.step(state, action), state.info["held"])
+        return self._with_held(self.env.step(state, action), state.info["held"])

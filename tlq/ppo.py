@@ -31,7 +31,7 @@ NORMALISED = ("state", "privileged_state")
 STREAMS = 16
 """Groups of environments that are shuffled each by itself: a minibatch doesn't depend on the number of devices."""
 STRIDE = 5
-"""A minibatch of the guide has every fifth step of its environments: their neighbours say nearly the same."""
+"""The guide that teaches the footholds is asked at every fifth step: the steps between say nearly the same."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,8 +74,9 @@ class PPOConfig:
     own for them (`policy.foothold_head`), which the guide teaches apart."""
     guide_rate: float = 1e-3
     """Adam's learning rate of the part of the policy that leads feet to footholds."""
-    guide_epochs: int = 2
-    """Passes over the data of an iteration in which the guide teaches that part."""
+    guide_epochs: int = 5
+    """Passes over what the guide says of an iteration, in which it teaches that part. It is asked at every fifth step,
+    if five divides the unroll."""
     average: float = 0.98
     """What an iteration keeps of the average of the policy's parameters, which is what `policy.npz` holds: the last 50
     iterations or so, without the noise of single updates. 0: the last parameters."""
@@ -83,6 +84,10 @@ class PPOConfig:
     """Weight in PPO's loss of the squares of the rest's residuals, before tanh, as far as that part takes them over.
     They have no effect then and drift off, to where there is much to make up for whenever the share changes. Whether
     0.03 or so helps isn't known yet (docs/experiments.md)."""
+
+
+Constants = dict[str, list[jax.Array]]
+"""What the environment's functions close over, by the function: 'reset', 'step', 'guide'."""
 
 
 @flax.struct.dataclass
@@ -111,7 +116,7 @@ class Rollout:
     reward: jax.Array  # (T, B)
     done: jax.Array  # (T, B)
     truncation: jax.Array  # (T, B)
-    guide: Guidance | None  # (T, B, ...) what a guide to footholds says, if there is one
+    guide: Guidance | None  # (T / stride, B, ...) what a guide to footholds says, if there is one
     footholds: dict[str, jax.Array] | None  # (T, B, 12) each, see `Policy`, if there is a part for them
 
 
@@ -163,6 +168,9 @@ class Learner:
                 f"{self.devices} x {config.minibatches}"
             )
         self.steps_per_iteration = num_envs * config.unroll
+        self.guided = hasattr(env, "guidance")
+        # In PPO's own loss the guide has a say at every step.
+        self.stride = 1 if networks.footholds is None else math.gcd(STRIDE, config.unroll)
         self._optimiser = optax.chain(
             optax.clip_by_global_norm(config.max_grad_norm), optax.scale_by_adam(eps=1e-5)
         )
@@ -192,19 +200,19 @@ class Learner:
 
     def step(self, state: TrainState) -> tuple[TrainState, dict[str, jax.Array]]:
         """One iteration: the next state, and the figures () of this one."""
-        return self._jitted(self._step_constants, state)
+        return self._jitted(self._constants, state)
 
     def batch(self, state: TrainState) -> dict[str, jax.Array]:
         """What `step` would learn from: each part of the rollout by name (T, B, ...), `carry` and `last` (B, ...)."""
 
-        def roll(constants: list[jax.Array], state: TrainState):
+        def roll(constants: Constants, state: TrainState):
             _, key, _ = jax.random.split(state.key, 3)
             env_state, rollout, _ = self._rollout(constants, state, key)
             return rollout, state.env_state.obs["carry"], env_state.obs["privileged_state"]
 
         specs = (P(), self.specs), (P(None, AXIS), P(AXIS), P(AXIS))
         shared = jax.shard_map(roll, mesh=self.mesh, in_specs=specs[0], out_specs=specs[1], check_vma=False)
-        rollout, carry, last = jax.jit(shared)(self._step_constants, state)
+        rollout, carry, last = jax.jit(shared)(self._constants, state)
         parts = {f.name: getattr(rollout, f.name) for f in dataclasses.fields(rollout)}
         parts = {name: part for name, part in parts.items() if part is not None}
         observation, guidance = parts.pop("observation"), parts.pop("guide", None)
@@ -217,7 +225,7 @@ class Learner:
     def init(self, seed: int) -> TrainState:
         """State before the first iteration, placed on the mesh."""
         init = jax.jit(self._init, out_shardings=self.shardings())
-        return init(self._reset_constants, jax.random.PRNGKey(seed))
+        return init(self._constants, jax.random.PRNGKey(seed))
 
     def shardings(self) -> TrainState:
         """Sharding of every part of the state."""
@@ -229,7 +237,7 @@ class Learner:
         """Splits the environment into functions and the arrays they close over, which are put on every device."""
         keys = jax.eval_shape(lambda: jax.random.split(jax.random.PRNGKey(0), self.num_envs))
         env_state = jax.eval_shape(self.env.reset, keys)
-        if self.networks.footholds is not None and "guide" not in env_state.info:
+        if self.networks.footholds is not None and not self.guided:
             raise ValueError(
                 "nobody teaches the footholds: set foothold_head=0 or wrap the environment in Guided"
             )
@@ -239,17 +247,19 @@ class Learner:
             "action": jax.ShapeDtypeStruct((here, self.env.action_size), jnp.float32),
             "carry": env_state.obs["carry"],
         }
+        ask = jax.vmap(self.env.guidance) if self.guided else lambda state: None
         reset_constants, self._env_reset = hoist(self.env.reset, keys)
         step_constants, self._env_step = hoist(self.env.step, env_state, action)
-        # One copy of what both need.
+        guide_constants, self._ask_guide = hoist(ask, env_state)
+        # One copy of what several need.
         everywhere = NamedSharding(self.mesh, P())
-        placed = {id(x): jax.device_put(x, everywhere) for x in [*reset_constants, *step_constants]}
-        self._reset_constants = [placed[id(x)] for x in reset_constants]
-        self._step_constants = [placed[id(x)] for x in step_constants]
+        constants = {"reset": reset_constants, "step": step_constants, "guide": guide_constants}
+        placed = {id(x): jax.device_put(x, everywhere) for part in constants.values() for x in part}
+        self._constants = {name: [placed[id(x)] for x in part] for name, part in constants.items()}
 
-    def _init(self, constants: list[jax.Array], key: jax.Array) -> TrainState:
+    def _init(self, constants: Constants, key: jax.Array) -> TrainState:
         key, key_env, key_policy, key_value = jax.random.split(key, 4)
-        env_state = self._env_reset(constants, jax.random.split(key_env, self.num_envs))
+        env_state = self._env_reset(constants["reset"], jax.random.split(key_env, self.num_envs))
         params = PPONetworkParams(
             policy=self.networks.policy_network.init(key_policy),
             value=self.networks.value_network.init(key_value),
@@ -275,7 +285,7 @@ class Learner:
     # -- one iteration, on each device ---------------------------------------------------------------------------------
 
     def _iteration(
-        self, constants: list[jax.Array], state: TrainState
+        self, constants: Constants, state: TrainState
     ) -> tuple[TrainState, dict[str, jax.Array]]:
         key, key_rollout, key_update = jax.random.split(state.key, 3)
         carry = state.env_state.obs["carry"]
@@ -315,9 +325,9 @@ class Learner:
         return jax.tree.map(lambda old, new: keep * old + (1.0 - keep) * new, state.average, policy)
 
     def _rollout(
-        self, constants: list[jax.Array], state: TrainState, key: jax.Array
+        self, constants: Constants, state: TrainState, key: jax.Array
     ) -> tuple[State, Rollout, dict[str, jax.Array]]:
-        """T steps with sampled actions; metrics are sums over T and means over B, see `summarise`."""
+        """T steps with sampled actions; metrics are means over T and B, see `summarise`."""
         policy, distribution = self.networks.policy_network, self.networks.parametric_action_distribution
         numbers = self._numbers()
 
@@ -325,7 +335,7 @@ class Learner:
             obs = env_state.obs
             parameters = policy.apply(state.normaliser, state.params.policy, obs)
             raw = jax.vmap(distribution.sample_no_postprocessing)(parameters, _keys(key, numbers))
-            after = self._env_step(constants, env_state, distribution.postprocess(raw))
+            after = self._env_step(constants["step"], env_state, distribution.postprocess(raw))
             rollout = Rollout(
                 observation={k: obs[k] for k in (*NORMALISED, "is_first")},
                 action=raw["action"],
@@ -334,15 +344,23 @@ class Learner:
                 reward=after.reward,
                 done=after.done,
                 truncation=after.info["truncation"],
-                guide=env_state.info.get("guide"),
+                guide=None,
                 footholds=parameters.get("footholds"),
             )
             metrics = {k: jnp.mean(v) for k, v in after.metrics.items()}
             return after, (rollout, dict(metrics, reward=jnp.mean(after.reward)))
 
-        env_state, (rollout, metrics) = jax.lax.scan(
-            step, state.env_state, jax.random.split(key, self.config.unroll)
+        def piece(env_state: State, keys: jax.Array):
+            guidance = self._ask_guide(constants["guide"], env_state)
+            env_state, results = jax.lax.scan(step, env_state, keys)
+            return env_state, (guidance, results)
+
+        keys = jax.random.split(key, self.config.unroll)
+        env_state, (guidance, results) = jax.lax.scan(
+            piece, state.env_state, keys.reshape(-1, self.stride, *keys.shape[1:])
         )
+        rollout, metrics = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), results)
+        rollout = dataclasses.replace(rollout, guide=guidance)
         metrics = jax.tree.map(lambda x: jax.lax.pmean(jnp.mean(x, axis=0), AXIS), metrics)
         return env_state, rollout, summarise(metrics, self.steps_per_iteration)
 
@@ -417,24 +435,22 @@ class Learner:
         """
         c, footholds = self.config, state.params.policy["params"]["footholds"]
         assert rollout.footholds is not None
-        data = rollout.observation["state"], rollout.footholds["rest"], rollout.guide
-        stride = math.gcd(STRIDE, c.unroll)
-        chosen = jnp.repeat(self._minibatches(key, c.guide_epochs), stride, axis=0)
-        first = jnp.arange(len(chosen)) % stride
+        asked = jax.tree.map(
+            lambda x: x[:: self.stride], (rollout.observation["state"], rollout.footholds["rest"])
+        )
+        data = *asked, rollout.guide
 
-        def gradient_step(carried, inputs):
+        def gradient_step(carried, index):
             footholds, opt_state = carried
-            index, first = inputs
-            times = first + jnp.arange(0, c.unroll, stride)
-            batch = jax.tree.map(lambda x: x[times[:, None], index], data)
+            batch = jax.tree.map(lambda x: x[:, index], data)
             cost, grads = jax.value_and_grad(self._foothold_loss)(footholds, state.normaliser, *batch)
             cost, grads = jax.lax.pmean((cost, grads), AXIS)
             return self._descend(footholds, opt_state, grads, c.guide_rate), cost
 
         (footholds, opt_state), costs = jax.lax.scan(
-            gradient_step, (footholds, state.guide_opt_state), (chosen, first)
+            gradient_step, (footholds, state.guide_opt_state), self._minibatches(key, c.guide_epochs)
         )
-        return footholds, opt_state, jnp.mean(costs[-stride * c.minibatches :])
+        return footholds, opt_state, jnp.mean(costs[-c.minibatches :])
 
 
 def _keys(key: jax.Array, numbers: jax.Array) -> jax.Array:

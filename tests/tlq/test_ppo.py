@@ -69,7 +69,7 @@ def rollout_of(learner, state):
         out_specs=(P(AXIS), P(None, AXIS), P()),
         check_vma=False,
     )
-    return jax.jit(roll)(learner._step_constants, state, jax.random.PRNGKey(5))
+    return jax.jit(roll)(learner._constants, state, jax.random.PRNGKey(5))
 
 
 def test_replayed_probabilities_are_the_stored_ones(learner, trained):
@@ -187,9 +187,9 @@ def test_a_task_that_needs_the_memory(memory, solves):
 class Asking(Wrapper):
     """Says that there is more gap to one side of two feet, and that a third stands, whatever the state."""
 
-    def _ask(self, state):
+    def guidance(self, state):
         slope = jnp.linspace(0.0, 1.0, guide.SIDE)
-        guidance = guide.Guidance(
+        return guide.Guidance(
             lead=jnp.zeros((4, 2, 4)).at[:, 0, 0].set(0.1).at[:, 1, 1].set(0.1),
             legs=jnp.array([1, 2]),
             gaps=jnp.stack([jnp.tile(slope, (guide.SIDE, 1)), jnp.tile(1 - slope, (guide.SIDE, 1))]),
@@ -200,13 +200,6 @@ class Asking(Wrapper):
             hold=jnp.array([1.0, 0.0, 0.0, 0.0]),
             last=jnp.array([[0.03, -0.09], [0.03, 0.09]]),
         )
-        return state.replace(info=state.info | {"guide": guidance})
-
-    def reset(self, key):
-        return self._ask(self.env.reset(key))
-
-    def step(self, state, action):
-        return self._ask(self.env.step(state, action))
 
 
 @pytest.mark.slow
@@ -222,7 +215,7 @@ def test_a_policy_learns_where_its_guide_sees_ground(head):
         parameters = networks.policy_network.apply(state.normaliser, state.params.policy, obs)
         return jnp.tanh(parameters["action"][:, :ACTIONS])
 
-    said = state.env_state.info["guide"]
+    said = jax.vmap(learner.env.guidance)(state.env_state)
     before = float(jnp.mean(guide.cost(said, means(state))))
     for _ in range(12):
         state, metrics = learner.step(state)
