@@ -48,7 +48,7 @@ class QuadrupedEnv(Env):
         self._data = mjx.make_data(self._model)
         self._planes = physics.plane_ids(self.mj_model, config.num_planes)
         self._tree = self._make_tree()
-        self._near = tg.samples.within(config.rewards.terrain_ring)
+        self._near = tg.samples.within(config.rewards.terrain_ring, config.tg.sample_radius)
         self._instances, self._counts = self._by_kind()
 
     # -- Brax's interface
@@ -547,7 +547,7 @@ class QuadrupedEnv(Env):
           episode: what is judged.
           around: (L, P) m, terrain heights round the feet, world.
         """
-        offsets = jnp.asarray(tg.samples.ring_offsets()[self._near], jnp.float32)
+        offsets = jnp.asarray(tg.samples.ring_offsets(self.config.tg.sample_radius)[self._near], jnp.float32)
         there = self._heights(episode, self.landing_points(episode)[:, None] + offsets) + episode.qpos[2]
         highest = jnp.maximum(jnp.max(around, axis=1), jnp.max(there, axis=1))
         swing = tg.path.leg_phases(episode.controller.phase) > 0

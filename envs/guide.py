@@ -20,7 +20,7 @@ from envs.types import Episode
 
 CELL = 0.025
 """Spacing (m) of the points whose heights are compared."""
-REACH = 5
+REACH = 7
 """A foot can be sent this many cells to each side of the end of its step."""
 ERROR = 0.025
 """Standard deviation (m) of a landing foot from its place, by which the gaps near a place count."""

@@ -68,6 +68,7 @@ LIMITS: dict[str, tuple[float, float]] = {
     "tg.weight_compensation": (0.0, 2.0),
     "tg.start_time": (1e-3, 10.0),
     "tg.mirror_hysteresis": _SHARE,
+    "tg.sample_radius": (0.04, 0.5),
     "rewards.speed_low": (0.01, 10.0),
     "rewards.speed_high": (0.01, 10.0),
     "rewards.along": _WEIGHT,

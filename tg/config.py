@@ -2,7 +2,7 @@
 
 import dataclasses
 
-BEFORE = {"look_ahead": False, "retraction": 0.0, "finish_step": False}
+BEFORE = {"look_ahead": False, "retraction": 0.0, "finish_step": False, "sample_radius": 0.1}
 """Settings of policies from before there was such a setting."""
 
 
@@ -50,6 +50,9 @@ class TGConfig:
     look_ahead: bool = True
     """Sample the terrain round the place where a foot in swing ends its step; false: round the foot, as the paper
     does, so that the policy sees a foothold only when the foot is nearly there."""
+    sample_radius: float = 0.1
+    """Radius of the outer circle of height samples (m). In the middle of a gap twice as wide all samples are low, and
+    say nothing of where the ground is."""
     finish_step: bool = True
     """When told to stand, let feet in swing come down at the end of their step, and all feet stay there; false: the
     gait fades out where it is, and the feet come down, or are drawn, to below the hips."""

@@ -399,7 +399,7 @@ class Core:
 
     @functools.cached_property
     def _ring_offsets(self) -> Array:
-        return self._constant(samples.ring_offsets())
+        return self._constant(samples.ring_offsets(self.config.sample_radius))
 
     @functools.cached_property
     def _action_mirror(self) -> tuple[Array, Array]:

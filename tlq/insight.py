@@ -90,7 +90,7 @@ class RewardMeter:
             previous=self._desired,
             energy=-work / sim.controller.control_dt,
             swing=(moment.phases > 0) & sim.controller.core.stepping(state, command),
-            near=below[:, tg.samples.within(config.terrain_ring)],
+            near=below[:, tg.samples.within(config.terrain_ring, sim.controller.core.config.sample_radius)],
             highest=below.min(axis=1),
             lift=state.lift,
             rise=np.maximum(moment.ground.max(axis=1) - self._lift_off, 0.0),

@@ -23,7 +23,7 @@ RUNNING, REACHED, FELL, STUCK = range(4)
 ENDS = ("running", "reached", "fell", "stuck")
 """Names of what `Tally.ended` says."""
 
-_NEAR = tg.samples.within(0.03)
+_NEAR = tg.samples.within(tg.samples.INNER)
 
 
 class Moment(NamedTuple):

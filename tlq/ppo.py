@@ -40,8 +40,9 @@ class PPOConfig:
 
     unroll: int = 40
     """Steps T of each environment per iteration; 40 steps are one gait cycle at 1.25 Hz."""
-    epochs: int = 2
-    """Passes over the data of an iteration."""
+    epochs: int = 1
+    """Passes over the data of an iteration. Two learn no more by steps where the learning rate is adapted, and take a
+    sixth longer (docs/experiments.md)."""
     minibatches: int = 8
     """Gradient steps of a pass; each takes B / minibatches whole pieces of T steps."""
     discount: float = 0.99
@@ -284,9 +285,7 @@ class Learner:
 
     # -- one iteration, on each device ---------------------------------------------------------------------------------
 
-    def _iteration(
-        self, constants: Constants, state: TrainState
-    ) -> tuple[TrainState, dict[str, jax.Array]]:
+    def _iteration(self, constants: Constants, state: TrainState) -> tuple[TrainState, dict[str, jax.Array]]:
         key, key_rollout, key_update = jax.random.split(state.key, 3)
         carry = state.env_state.obs["carry"]
         env_state, rollout, env_metrics = self._rollout(constants, state, key_rollout)

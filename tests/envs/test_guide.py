@@ -271,7 +271,7 @@ def test_only_terrain_with_gaps_has_pits(exact):
 
 
 @pytest.mark.slow
-def test_a_guided_environment_adds_what_the_guide_says(exact):
+def test_a_guided_environment_can_be_asked(exact):
     env = envs.Guided(exact.auto)
     state = jax.jit(env.reset)(jax.random.key(0))
     after = jax.jit(env.step)(state, 0.5 * jnp.ones(14))

@@ -118,11 +118,12 @@ def test_retraction_gives_feet_the_grounds_speed():
     np.testing.assert_allclose(path.stride(phases, 0.5), half, atol=1e-12)
 
 
-def test_samples_lie_on_the_circles():
-    points = np.array(tg.samples.ring_offsets())
+@pytest.mark.parametrize(("third", "outer"), [(0.06, 0.10), (0.12, 0.24)])
+def test_samples_lie_on_the_circles(third, outer):
+    points = np.array(tg.samples.ring_offsets(outer))
     assert points.shape == (25, 2) and tg.samples.COUNT == 25
     start = 0
-    for ring, (count, radius) in enumerate([(1, 0.0), (6, 0.03), (8, 0.06), (10, 0.10)]):
+    for ring, (count, radius) in enumerate([(1, 0.0), (6, 0.03), (8, third), (10, outer)]):
         part = points[start : start + count]
         np.testing.assert_allclose(np.hypot(*part.T), radius, atol=1e-12)
         np.testing.assert_allclose(part[0], [radius, 0.0], atol=1e-12)  # the first lies in front
@@ -131,8 +132,8 @@ def test_samples_lie_on_the_circles():
             np.testing.assert_allclose(np.diff(turn), 2 * PI / count, atol=1e-9)
         assert tg.samples.circles()[ring] == slice(start, start + count)
         start += count
-        assert tg.samples.within(radius) == slice(0, start)
-        assert tg.samples.within(radius - 0.001) == slice(0, start - count)
+        assert tg.samples.within(radius, outer) == slice(0, start)
+        assert tg.samples.within(radius - 0.001, outer) == slice(0, start - count)
 
 
 def test_samples_are_their_own_mirror_image():

@@ -202,6 +202,26 @@ class Asking(Wrapper):
         )
 
 
+class Telling(Asking):
+    """Its guide repeats what is observed, so that it shows when it was asked."""
+
+    def guidance(self, state):
+        return super().guidance(state)._replace(ahead=state.obs["state"][:2])
+
+
+@pytest.mark.parametrize(("head", "unroll", "every"), [(16, 10, 5), (16, 12, 1), (0, 10, 1)])
+def test_the_guide_is_asked_at_every_fifth_step(head, unroll, every):
+    """If five divides the unroll, and PPO's own loss doesn't need it at every step."""
+    config = dataclasses.replace(CONFIG, unroll=unroll)
+    learner = make_learner(config=config, env=Telling(ToyEnv(length=5)), foothold_head=head)
+    parts = jax.eval_shape(learner.batch, jax.eval_shape(learner.init, 0))
+    assert parts["guide_ahead"].shape == (unroll // every, B, 2)
+    if every > 1:
+        parts = learner.batch(learner.init(0))
+        np.testing.assert_array_equal(parts["guide_ahead"], parts["state"][::every, :, :2])
+        assert (np.asarray(parts["state"][1]) != parts["state"][0]).any()
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("head", [0, 16])
 def test_a_policy_learns_where_its_guide_sees_ground(head):
