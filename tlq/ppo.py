@@ -41,8 +41,8 @@ class PPOConfig:
     unroll: int = 40
     """Steps T of each environment per iteration; 40 steps are one gait cycle at 1.25 Hz."""
     epochs: int = 1
-    """Passes over the data of an iteration. Two learn no more by steps where the learning rate is adapted, and take a
-    sixth longer (docs/experiments.md)."""
+    """Passes over the data of an iteration. Two learn little more by steps, and take a sixth longer
+    (docs/experiments.md)."""
     minibatches: int = 8
     """Gradient steps of a pass; each takes B / minibatches whole pieces of T steps."""
     discount: float = 0.99
