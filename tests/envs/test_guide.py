@@ -77,7 +77,8 @@ def test_feet_are_led_to_the_best_ground_near(exact, command):
         for leg, end in zip(legs, ends, strict=True):
             share = np.clip((phases[leg] - guide.LIFTING) / (guide.ARRIVED - guide.LIFTING), 0.0, 1.0)
             shares.append(3 * share**2 - 2 * share**3)
-            now = np.clip(np.asarray(residual)[leg, :2] / max(shares[-1], 0.3), -0.125, 0.125)
+            reach = guide.REACH * guide.CELL
+            now = np.clip(np.asarray(residual)[leg, :2] / max(shares[-1], 0.3), -reach, reach)
             gaps = gap_shares(lambda way, end=end, xy=xy: ground(terrain, env, xy, end + way), c.rewards)
             away = np.linalg.norm(now - guide.places(), axis=1)
             far = np.linalg.norm(balance - guide.places(), axis=1)
