@@ -31,7 +31,8 @@ NORMALISED = ("state", "privileged_state")
 STREAMS = 16
 """Groups of environments that are shuffled each by itself: a minibatch doesn't depend on the number of devices."""
 STRIDE = 5
-"""The guide that teaches the footholds is asked at every fifth step: the steps between say nearly the same."""
+"""The guide that teaches the footholds is asked at every fifth step, or at the nearest below that divides the unroll:
+the steps between say nearly the same."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,8 +77,8 @@ class PPOConfig:
     guide_rate: float = 1e-3
     """Adam's learning rate of the part of the policy that leads feet to footholds."""
     guide_epochs: int = 5
-    """Passes over what the guide says of an iteration, in which it teaches that part. It is asked at every fifth step,
-    if five divides the unroll."""
+    """Passes over what the guide says of an iteration, in which it teaches that part. It is asked at every fifth step
+    (fourth, third, ... where five doesn't divide the unroll)."""
     average: float = 0.98
     """What an iteration keeps of the average of the policy's parameters, which is what `policy.npz` holds: the last 50
     iterations or so, without the noise of single updates. 0: the last parameters."""
@@ -171,7 +172,8 @@ class Learner:
         self.steps_per_iteration = num_envs * config.unroll
         self.guided = hasattr(env, "guidance")
         # In PPO's own loss the guide has a say at every step.
-        self.stride = 1 if networks.footholds is None else math.gcd(STRIDE, config.unroll)
+        strides = [s for s in range(1, STRIDE + 1) if config.unroll % s == 0]
+        self.stride = 1 if networks.footholds is None else strides[-1]
         self._optimiser = optax.chain(
             optax.clip_by_global_norm(config.max_grad_norm), optax.scale_by_adam(eps=1e-5)
         )
@@ -359,7 +361,7 @@ class Learner:
             piece, state.env_state, keys.reshape(-1, self.stride, *keys.shape[1:])
         )
         rollout, metrics = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), results)
-        rollout = dataclasses.replace(rollout, guide=guidance)
+        rollout = rollout.replace(guide=guidance)
         metrics = jax.tree.map(lambda x: jax.lax.pmean(jnp.mean(x, axis=0), AXIS), metrics)
         return env_state, rollout, summarise(metrics, self.steps_per_iteration)
 

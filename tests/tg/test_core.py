@@ -252,13 +252,15 @@ def test_feet_are_mujocos(subject):
     np.testing.assert_allclose(subject.core.feet(sensors), expected, atol=1e-7)
 
 
-def test_points_lie_on_circles(subject):
-    core = subject.core
+@pytest.mark.parametrize(("outer", "third"), [(0.10, 0.06), (0.24, 0.12)])
+def test_points_lie_on_circles(subject, outer, third):
+    settings = dataclasses.replace(subject.core.config, sample_radius=outer)
+    core = dataclasses.replace(subject.core, config=settings)
     feet = core.feet(random_sensors(core, 3))
     points = core.around(feet)
     assert points.shape == (4, 25, 2)
     distance = np.linalg.norm(points - feet[:, None, :2], axis=-1)
-    radii = np.repeat([0.0, 0.03, 0.06, 0.10], [1, 6, 8, 10])
+    radii = np.repeat([0.0, 0.03, third, outer], [1, 6, 8, 10])
     np.testing.assert_allclose(np.sort(distance, axis=1), np.tile(radii, (4, 1)), atol=1e-7)
 
 
