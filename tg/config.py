@@ -2,7 +2,7 @@
 
 import dataclasses
 
-BEFORE = {"look_ahead": False, "retraction": 0.0, "finish_step": False, "sample_radius": 0.1}
+BEFORE = {"look_ahead": False, "retraction": 0.0, "finish_step": False, "follow": False, "sample_radius": 0.1}
 """Settings of policies from before there was such a setting."""
 
 
@@ -50,6 +50,10 @@ class TGConfig:
     look_ahead: bool = True
     """Sample the terrain round the place where a foot in swing ends its step; false: round the foot, as the paper
     does, so that the policy sees a foothold only when the foot is nearly there."""
+    follow: bool = True
+    """With `look_ahead`, sample the terrain round the place to which trajectory generator and residual joint angles
+    together lead a foot, so that the policy sees the ground there closely; false: round the end of the trajectory
+    generator's step."""
     sample_radius: float = 0.1
     """Radius of the outer circle of height samples (m). In the middle of a gap twice as wide all samples are low, and
     say nothing of where the ground is."""

@@ -163,12 +163,14 @@ class Core:
         return self.around(self.centres(state, sensors))
 
     def centres(self, state: ControllerState, sensors: Sensors) -> Array:
-        """Centres (4, 2) m of the circles of `sample_points`: the feet, or where their steps end (`look_ahead`)."""
+        """Centres (4, 2) m of the circles of `sample_points`: the feet, or where steps end (`look_ahead`, `follow`)."""
         feet = self.feet(sensors)[:, :2]
         if not self.config.look_ahead:
             return feet
         xp = feet.__array_namespace__()
         ends = self.step_ends(state, sensors, self.odometry(state, sensors))
+        if self.config.follow:
+            ends = ends + self.residual_displacement(state, sensors)[:, :2]
         # A robot that stands still has feet in swing by their phase, but they stay where they are.
         share = xp.where(path.leg_phases(state.phase) > 0, state.gate, 0.0 * state.gate)[:, None]
         return feet + share * (ends - feet)

@@ -49,7 +49,7 @@ def ppo_loss(
     """
     distribution = networks.parametric_action_distribution
     observation: dict[str, Any] = dict(rollout.observation, carry=carry[None])
-    if networks.footholds is not None:
+    if networks.footholds is not None and not config.train_footholds:
         # To PPO the footholds are part of the world: their parameters stay as they acted and get no gradient.
         observation["footholds"] = rollout.footholds
     parameters = networks.policy_network.apply(normaliser, params.policy, observation)

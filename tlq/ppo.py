@@ -79,6 +79,9 @@ class PPOConfig:
     guide_epochs: int = 5
     """Passes over what the guide says of an iteration, in which it teaches that part. It is asked at every fifth step
     (fourth, third, ... where five doesn't divide the unroll)."""
+    train_footholds: bool = False
+    """PPO trains that part, too, by what the footsteps led to; the guide goes on teaching it (`guide_rate`). For a
+    policy that knows its footholds nearly as well as the guide can say."""
     average: float = 0.98
     """What an iteration keeps of the average of the policy's parameters, which is what `policy.npz` holds: the last 50
     iterations or so, without the noise of single updates. 0: the last parameters."""
@@ -424,17 +427,22 @@ class Learner:
         figures, guide_opt_state = _loss_metrics(losses, c.minibatches), state.guide_opt_state
         if self.networks.footholds is not None:
             # 2: the two keys above are those folded with 0 and 1.
-            footholds, guide_opt_state, cost = self._teach(state, rollout, jax.random.fold_in(key, 2))
+            footholds, guide_opt_state, cost = self._teach(
+                state, params.policy["params"]["footholds"], rollout, jax.random.fold_in(key, 2)
+            )
             params = params.replace(policy={"params": dict(params.policy["params"], footholds=footholds)})
             figures["loss/guide"] = cost
         return params, opt_state, guide_opt_state, figures
 
-    def _teach(self, state: TrainState, rollout: Rollout, key: jax.Array) -> tuple[Any, Any, jax.Array]:
+    def _teach(
+        self, state: TrainState, footholds: Any, rollout: Rollout, key: jax.Array
+    ) -> tuple[Any, Any, jax.Array]:
         """`guide_epochs` passes by which the footholds cost less, with the rest of the policy as it acted.
 
-        Returns their parameters, their optimiser's state, and the mean cost () in the last pass.
+        footholds: their parameters. Returns the next ones, their optimiser's state, and the mean cost () in the last
+        pass.
         """
-        c, footholds = self.config, state.params.policy["params"]["footholds"]
+        c = self.config
         assert rollout.footholds is not None
         asked = jax.tree.map(
             lambda x: x[:: self.stride], (rollout.observation["state"], rollout.footholds["rest"])

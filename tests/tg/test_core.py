@@ -267,6 +267,7 @@ def test_points_lie_on_circles(subject, outer, third):
 def test_heights_are_wanted_where_steps_end(subject):
     """Of feet in stance, of a robot that stands, and without look-ahead: round the feet."""
     core, sensors = subject.core, random_sensors(subject.core, 3)
+    core = dataclasses.replace(core, config=dataclasses.replace(core.config, follow=False))
     feet, state = core.feet(sensors)[:, :2], walk(core, 20)[-1][0]
     swing = tg.path.leg_phases(state.phase) > 0
     assert swing.sum() == 2 and state.gate == 1
@@ -275,6 +276,11 @@ def test_heights_are_wanted_where_steps_end(subject):
     assert np.abs(ends - feet)[swing].max() > 0.02
     np.testing.assert_allclose(core.sample_points(state, sensors), core.around(expected))
     np.testing.assert_allclose(core.centres(state._replace(gate=0.0 * state.gate), sensors), feet)
+    followed = dataclasses.replace(core, config=dataclasses.replace(core.config, follow=True))
+    moved = core.residual_displacement(state, sensors)[:, :2]
+    assert np.abs(moved)[swing].max() > 0.01
+    expected = np.where(swing[:, None], ends + moved, feet)
+    np.testing.assert_allclose(followed.sample_points(state, sensors), core.around(expected))
     behind = dataclasses.replace(core, config=dataclasses.replace(core.config, look_ahead=False))
     np.testing.assert_allclose(behind.sample_points(state, sensors), core.around(feet))
 
