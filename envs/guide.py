@@ -7,7 +7,7 @@ would have saved a footstep; this tells it, by its slope (`ppo.guide` is the wei
 was tried: which one is best is ambiguous, and the mean of two poles is a gap (docs/experiments.md).
 """
 
-from typing import NamedTuple, cast
+from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -51,6 +51,8 @@ STEADY = 0.06
 square of it: a foot follows its joints' targets late, so where those still move about it comes down beside them."""
 LED = 0.02
 """Displacement (m) from which on a foot is held altogether."""
+SETTLED = 2
+"""Control steps after which a foot has come down: it goes on for some millimetres at first."""
 SMOOTHING = 0.3
 """Share of each step's displacement in the one that is held: actions are noisy while a policy learns."""
 CANDIDATES = 16
@@ -225,6 +227,12 @@ class Guidance(NamedTuple):
     """(4,) how much that counts, 0 in swing."""
     last: jax.Array
     """(2, 2) m, where the last action would lead the two feet in swing."""
+    error: jax.Array
+    """(2, 2) m, how far from where they are led at last they come down; see `with_errors`."""
+    known: jax.Array
+    """(2,) 0 for feet that nothing is said of where they had better be led."""
+    mirror: jax.Array
+    """(), -1 if all this is mirrored."""
 
 
 def guide(env: QuadrupedEnv, episode: Episode, held: jax.Array) -> Guidance:
@@ -245,6 +253,9 @@ def guide(env: QuadrupedEnv, episode: Episode, held: jax.Array) -> Guidance:
         held=held,
         hold=jnp.where(stance, jnp.clip(jnp.linalg.norm(held, axis=-1) / LED, 0.0, 1.0), 0.0),
         last=last[s.legs],
+        error=jnp.zeros((2, 2)),
+        known=jnp.ones(2),
+        mirror=jnp.float32(1.0),
     )
     mirror = env.core.update_mirror(controller.mirror, env.heading_command(episode))
     return jax.tree.map(lambda mine, other: jnp.where(mirror > 0, mine, other), own, _mirrored(own))
@@ -282,7 +293,51 @@ def _mirrored(guidance: Guidance) -> Guidance:
         held=guidance.held[swapped] * side,
         hold=guidance.hold[swapped],
         last=guidance.last * side,
+        error=guidance.error * side,
+        known=guidance.known,
+        mirror=-guidance.mirror,
     )
+
+
+def with_errors(guidance: Guidance, error: jax.Array, known: jax.Array) -> Guidance:
+    """What the guide says with hindsight: it reckons with the error with which each foot came down.
+
+    Joints follow late, legs give way under load and the trunk moves: feet come down centimetres beside the place to
+    which they were led, in part always to the same side. What is taught then leaves room for all that, as far as the
+    policy can't know it, and makes up for it as far as it can.
+
+    Args:
+      guidance: of an episode's step.
+      error: (4, 2) m, how far from where they were led the feet came down next, heading frame, the robot's own sides.
+      known: (4,) whether that is known.
+    """
+    swapped = jnp.array([1, 0, 3, 2], jnp.int32)
+    own = jnp.where(guidance.mirror > 0, guidance.legs, swapped[guidance.legs])
+    side = jnp.stack([jnp.ones_like(guidance.mirror), guidance.mirror])
+    return guidance._replace(error=error[own] * side, known=1.0 * known[own])
+
+
+def next_errors(missed: jax.Array, landed: jax.Array, done: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """For each of T steps the errors with which the feet come down next, and whether they do.
+
+    Args:
+      missed: (T, ..., 4, 2) m, errors of the feet that came down in a step.
+      landed: (T, ..., 4) whether they did.
+      done: (T, ...) whether the episode ended with the step.
+
+    Returns:
+      (T, ..., 4, 2) m and (T, ..., 4) of the landings in that step or later.
+    """
+
+    def back(later: tuple[jax.Array, jax.Array], now: tuple[jax.Array, ...]) -> tuple[Any, Any]:
+        error, known = later
+        missed, landed, done = now
+        known = known & (done[..., None] == 0)
+        error = jnp.where(landed[..., None], missed, error)
+        return ((error, known | landed),) * 2
+
+    nothing = jnp.zeros_like(missed[0]), jnp.zeros(landed.shape[1:], bool)
+    return jax.lax.scan(back, nothing, (missed, landed, done), reverse=True)[1]
 
 
 def cost(guidance: Guidance, action: jax.Array) -> jax.Array:
@@ -299,10 +354,12 @@ def cost(guidance: Guidance, action: jax.Array) -> jax.Array:
     off = led - guidance.ahead[..., None, :]
     far = jnp.sqrt(jnp.sum(jnp.square(off), axis=-1) + 1e-6)  # a slope at 0, too
     moved = jnp.sum(jnp.square((led - guidance.last) / STEADY), axis=-1)
-    each = GAP * between(guidance.gaps.astype(jnp.float32), led) + FARTHER * far + BEYOND * beyond + moved
+    gap = between(guidance.gaps.astype(jnp.float32), led + guidance.error)
+    each = GAP * gap + FARTHER * far + BEYOND * beyond + moved
     middle = jnp.abs(jnp.sum(jnp.mean(off, axis=-2) * guidance.across, axis=-1))
-    both = jnp.min(guidance.weight, axis=-1)
-    return jnp.sum(guidance.weight * each, axis=-1) + both * ACROSS * middle + HOLD * let_go
+    weight = guidance.weight * guidance.known
+    both = jnp.min(weight, axis=-1)
+    return jnp.sum(weight * each, axis=-1) + both * ACROSS * middle + HOLD * let_go
 
 
 def idle(guidance: Guidance, added: jax.Array) -> jax.Array:
@@ -315,11 +372,24 @@ def idle(guidance: Guidance, added: jax.Array) -> jax.Array:
     return jnp.sum((ALWAYS + IDLE * (1.0 - asked)) * squares, axis=-1)
 
 
+class Landings(NamedTuple):
+    """How the feet come down, as `Guided` follows them. L = 4 legs."""
+
+    led: jax.Array
+    """(L, 2) m, world: the place to which a foot in swing is led, in stance to which it was led last."""
+    stood: jax.Array
+    """(L,) int32, control steps since it came down; 0 in swing."""
+    landed: jax.Array
+    """(L,) bool, whether it has come down now (`SETTLED`)."""
+    missed: jax.Array
+    """(L, 2) m, heading frame, from where it was led to where it is; of use where it has come down now."""
+
+
 class Guided(Wrapper):
     """An environment with a method `guidance`, which says what the guide thinks of the next action.
 
     Its state's info has, as 'held' (4, 2) m, heading frame, where the feet are led by residual joint angles, smoothed;
-    in stance, where they were led when they came down.
+    in stance, where they were led when they came down. And `Landings` as 'landings'.
     """
 
     def __init__(self, env: Env):
@@ -329,19 +399,35 @@ class Guided(Wrapper):
         """Of a state's next action."""
         return guide(cast(QuadrupedEnv, self.env.unwrapped), state.pipeline_state, state.info["held"])
 
-    def _with_held(self, state: State, held: jax.Array) -> State:
+    def _followed(self, state: State, held: jax.Array, landings: Landings) -> State:
         env = cast(QuadrupedEnv, self.env.unwrapped)
         episode: Episode = state.pipeline_state
-        controller = episode.controller
-        now = env.core.residual_displacement(controller, exact_sensors(episode))[:, :2]
-        swing = tg.path.leg_phases(controller.phase)[:, None] > 0
-        held = jnp.where(state.done > 0, 0.0, jnp.where(swing, held + SMOOTHING * (now - held), held))
-        return state.replace(info=state.info | {"held": held})
+        controller, sensors = episode.controller, exact_sensors(episode)
+        now = env.core.residual_displacement(controller, sensors)[:, :2]
+        swing = tg.path.leg_phases(controller.phase) > 0
+        held = jnp.where(swing[:, None], held + SMOOTHING * (now - held), held)
+        yaw = tg.frames.yaw(episode.qpos[3:7])
+        led = episode.qpos[:2] + tg.frames.turn(yaw, env.step_ends(episode) + now)
+        led = jnp.where(swing[:, None], led, landings.led)
+        stood = jnp.where(swing, 0, landings.stood + 1)
+        feet = episode.qpos[:2] + tg.frames.turn(yaw, env.core.feet(sensors)[:, :2])
+        over = state.done > 0
+        landings = Landings(
+            led=led,
+            # Feet of an episode that begins haven't been led anywhere.
+            stood=jnp.where(over, SETTLED, stood),
+            landed=(stood == SETTLED) & ~over,
+            missed=tg.frames.turn(-yaw, feet - led),
+        )
+        return state.replace(info=state.info | {"held": jnp.where(over, 0.0, held), "landings": landings})
 
     def reset(self, key: jax.Array) -> State:
         """As the environment's."""
-        return self._with_held(self.env.reset(key), jnp.zeros((4, 2)))
+        nothing = Landings(
+            jnp.zeros((4, 2)), jnp.full(4, SETTLED, jnp.int32), jnp.zeros(4, bool), jnp.zeros((4, 2))
+        )
+        return self._followed(self.env.reset(key), jnp.zeros((4, 2)), nothing)
 
     def step(self, state: State, action: jax.Array) -> State:
         """As the environment's."""
-        return self._with_held(self.env.step(state, action), state.info["held"])
+        return self._followed(self.env.step(state, action), state.info["held"], state.info["landings"])

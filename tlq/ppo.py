@@ -22,7 +22,7 @@ from brax.training.agents.ppo.losses import PPONetworkParams
 from jax.sharding import Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
 
-from envs import Guidance
+from envs import Guidance, guide
 from tlq.loss import foothold_loss, ppo_loss
 from tlq.networks import Networks
 
@@ -352,7 +352,7 @@ class Learner:
                 footholds=parameters.get("footholds"),
             )
             metrics = {k: jnp.mean(v) for k, v in after.metrics.items()}
-            return after, (rollout, dict(metrics, reward=jnp.mean(after.reward)))
+            return after, (rollout, after.info.get("landings"), dict(metrics, reward=jnp.mean(after.reward)))
 
         def piece(env_state: State, keys: jax.Array):
             guidance = self._ask_guide(constants["guide"], env_state)
@@ -363,7 +363,11 @@ class Learner:
         env_state, (guidance, results) = jax.lax.scan(
             piece, state.env_state, keys.reshape(-1, self.stride, *keys.shape[1:])
         )
-        rollout, metrics = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), results)
+        rollout, landings, metrics = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), results)
+        if guidance is not None:
+            errors = guide.next_errors(landings.missed, landings.landed, rollout.done)
+            errors = jax.tree.map(lambda x: x[:: self.stride], errors)
+            guidance = jax.vmap(jax.vmap(guide.with_errors))(guidance, *errors)
         rollout = rollout.replace(guide=guidance)
         metrics = jax.tree.map(lambda x: jax.lax.pmean(jnp.mean(x, axis=0), AXIS), metrics)
         return env_state, rollout, summarise(metrics, self.steps_per_iteration)

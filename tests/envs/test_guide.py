@@ -185,16 +185,18 @@ def slow_cost(guidance, action):
     feet = [lead[:, :3] @ action[2 + 3 * i : 5 + 3 * i] + lead[:, 3] for i, lead in enumerate(guidance.lead)]
     for foot, held, hold in zip(feet, guidance.held, guidance.hold, strict=True):
         total += guide.HOLD * hold * sum((foot - held) ** 2) / guide.HELD**2
-    swinging = zip(guidance.gaps, guidance.legs, guidance.weight, guidance.last, strict=True)
-    for gaps, leg, weight, last in swinging:
+    weights = guidance.weight * guidance.known
+    swinging = zip(guidance.gaps, guidance.legs, weights, guidance.last, guidance.error, strict=True)
+    for gaps, leg, weight, last, error in swinging:
         led = feet[leg]
         inside = np.clip(led, axis[0], axis[-1])
-        gap = interpolate.RegularGridInterpolator((axis, axis), gaps.astype(float))(inside)[0]
+        landed = np.clip(led + error, axis[0], axis[-1])
+        gap = interpolate.RegularGridInterpolator((axis, axis), gaps.astype(float))(landed)[0]
         away = np.linalg.norm(led - guidance.ahead)
         total += weight * (guide.GAP * gap + guide.FARTHER * away + guide.BEYOND * np.abs(led - inside).sum())
         total += weight * sum((led - last) ** 2) / guide.STEADY**2
         middle += (led - guidance.ahead) / 2
-    return total + guidance.weight.min() * guide.ACROSS * abs(middle @ guidance.across)
+    return total + weights.min() * guide.ACROSS * abs(middle @ guidance.across)
 
 
 def test_legs_that_nothing_is_asked_of_cost_by_what_they_are_moved():
@@ -230,10 +232,46 @@ def test_cost_against_a_loop():
             held=random.normal(scale=0.05, size=(4, 2)).astype(np.float32),
             hold=random.uniform(0, 1, 4).astype(np.float32),
             last=random.normal(scale=0.05, size=(2, 2)).astype(np.float32),
+            error=random.normal(scale=0.02, size=(2, 2)).astype(np.float32),
+            known=(random.uniform(size=2) < 0.8).astype(np.float32),
+            mirror=np.float32(1.0),
         )
         action = random.uniform(-1, 1, 14).astype(np.float32)
         found = guide.cost(jax.tree.map(jnp.asarray, guidance), jnp.asarray(action))
         np.testing.assert_allclose(found, slow_cost(guidance, action), rtol=1e-4, atol=0.005)
+
+
+def test_errors_are_those_of_the_next_landing():
+    random = np.random.default_rng(5)
+    steps, robots = 30, 3
+    missed = random.normal(size=(steps, robots, 4, 2)).astype(np.float32)
+    landed = random.uniform(size=(steps, robots, 4)) < 0.1
+    done = (random.uniform(size=(steps, robots)) < 0.05).astype(np.float32)
+    error, known = (
+        np.asarray(x) for x in guide.next_errors(*(jnp.asarray(x) for x in (missed, landed, done)))
+    )
+    for t, robot, leg in np.ndindex(steps, robots, 4):
+        later = t
+        while later < steps and not landed[later, robot, leg] and not done[later, robot]:
+            later += 1
+        found = later < steps and landed[later, robot, leg]
+        assert known[t, robot, leg] == found
+        if found:
+            np.testing.assert_array_equal(error[t, robot, leg], missed[later, robot, leg])
+
+
+@pytest.mark.parametrize("mirror", [1.0, -1.0])
+def test_hindsight_knows_the_policys_own_sides(exact, mirror):
+    env, k = exact.env, exact.find("poles", 9)
+    episode = walking(exact, k, np.zeros(2), LEFT if mirror > 0 else RIGHT, phase=2.0, mirror=mirror)
+    guidance, steps = guide.guide(env, episode, jnp.zeros((4, 2))), guide.steps(env, episode)
+    assert guidance.mirror == mirror and np.all(guidance.known == 1) and np.all(guidance.error == 0)
+    error = np.arange(8.0).reshape(4, 2) + 1
+    known = np.array([True, False, False, True])
+    with_errors = guide.with_errors(guidance, jnp.asarray(error), jnp.asarray(known))
+    np.testing.assert_array_equal(with_errors.error, error[steps.legs] * [1, mirror])
+    np.testing.assert_array_equal(with_errors.known, known[steps.legs])
+    np.testing.assert_array_equal(with_errors.weight, guidance.weight)
 
 
 def test_its_slope_leads_feet_off_the_gaps(exact, monkeypatch):
@@ -288,3 +326,40 @@ def test_a_guided_environment_can_be_asked(exact):
     standing_still = alone(change_episode(after.pipeline_state, command=np.zeros(2)))
     np.testing.assert_array_equal(standing_still.weight, 0)
     np.testing.assert_array_equal(standing_still.hold, 0)
+
+
+@pytest.mark.slow
+def test_landings_are_where_feet_come_down(exact):
+    """Against the robot's states, one foot after the other."""
+    env, core = envs.Guided(exact.auto), exact.env.core
+    step, state = jax.jit(env.step), jax.jit(env.reset)(jax.random.key(1))
+
+    def places(episode):
+        """In the world: where the feet are led (4, 2) m, and where they are; and which are in swing."""
+        yaw, sensors = tg.frames.yaw(episode.qpos[3:7]), exact_sensors(episode)
+        led = exact.env.step_ends(episode) + core.residual_displacement(episode.controller, sensors)[:, :2]
+        feet, swing = core.feet(sensors)[:, :2], tg.path.leg_phases(episode.controller.phase) > 0
+        return [episode.qpos[:2] + tg.frames.turn(yaw, p) for p in (led, feet)], swing, yaw
+
+    places = jax.jit(places)
+    last, since, landings = [None] * 4, [None] * 4, 0
+    for number in range(80):
+        action = 0.3 * jnp.sin(0.3 * number + jnp.arange(14))
+        state = step(state, action)
+        (led, feet), swing, yaw = jax.tree.map(np.asarray, places(state.pipeline_state))
+        found = state.info["landings"]
+        for leg in range(4):
+            landed = False
+            if state.done:
+                last[leg] = since[leg] = None
+            elif swing[leg]:
+                last[leg], since[leg] = led[leg], 0
+            elif since[leg] is not None:
+                since[leg] += 1
+                landed = since[leg] == guide.SETTLED
+            assert found.landed[leg] == landed
+            if landed:
+                landings += 1
+                missed = tg.frames.turn(-yaw, feet[leg] - last[leg])
+                np.testing.assert_allclose(found.missed[leg], missed, atol=1e-5)
+    assert landings > 6
