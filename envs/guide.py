@@ -314,7 +314,7 @@ def with_errors(guidance: Guidance, error: jax.Array, known: jax.Array) -> Guida
     swapped = jnp.array([1, 0, 3, 2], jnp.int32)
     own = jnp.where(guidance.mirror > 0, guidance.legs, swapped[guidance.legs])
     side = jnp.stack([jnp.ones_like(guidance.mirror), guidance.mirror])
-    return guidance._replace(error=error[own] * side, known=1.0 * known[own])
+    return guidance._replace(error=error[own] * side, known=known[own].astype(jnp.float32))
 
 
 def next_errors(missed: jax.Array, landed: jax.Array, done: jax.Array) -> tuple[jax.Array, jax.Array]:

@@ -238,7 +238,7 @@ def policy_graph(policy: Any, arrays: Mapping[str, np.ndarray], heights: int) ->
       arrays: initialisers, for their shapes.
       heights: how many of the last entries of the observation are heights (not normalised).
     """
-    from tlq.networks import CLIP, RESIDUALS, SAME_SIDE
+    from tlq.networks import CLIP, LAST, RESIDUALS, SAME_SIDE
 
     b, size = _Builder(), arrays[_MEAN].size
     normal = b.add("Div", b.add("Sub", "observation", _MEAN), _STD)
@@ -270,14 +270,19 @@ def policy_graph(policy: Any, arrays: Mapping[str, np.ndarray], heights: int) ->
         if policy.leg_head:
             residuals = b.add("Add", residuals, _legs(b, policy, "", [foot], y)[0])
         if led:
-            residuals = _footholds(b, policy, proprio, heights_by_foot, residuals)
+            last = ""
+            if f"{_PARAMS}footholds.keep.kernel" in arrays:
+                last = b.add("Slice", "observation", axes=[-1], starts=[LAST.start], ends=[LAST.stop])
+            residuals = _footholds(b, policy, proprio, heights_by_foot, residuals, last)
         mean = b.add("Concat", shared, residuals, axis=-1)
     b.add("Tanh", mean, outputs=("action",))
     return b.nodes
 
 
-def _footholds(b: _Builder, policy: Any, proprio: str, foot: str, rest: str) -> str:
-    """Residuals (12,) of `tlq.networks.Footholds` with the rest's; foot: the heights (4, 25) of the feet."""
+def _footholds(b: _Builder, policy: Any, proprio: str, foot: str, rest: str, last: str) -> str:
+    """Residuals (12,) of `tlq.networks.Footholds` with the rest's; foot: the heights (4, 25) of the feet; last: those
+    (12,) of the last action, of which a share is kept, or empty.
+    """
     for i in range(len(policy.foot_encoder)):
         foot = b.elu(f"footholds.foot_{i}", foot)
     width = policy.foot_encoder[-1]
@@ -287,6 +292,9 @@ def _footholds(b: _Builder, policy: Any, proprio: str, foot: str, rest: str) -> 
     across = b.add("Reshape", across, shape=[policy.feet, width])
     own, leg = _legs(b, policy, "footholds.", [foot, across], b.elu("footholds.proprio", proprio))
     share = b.add("Reshape", b.dense("footholds.share", leg), shape=[3 * policy.feet])
+    if last:
+        keep = b.add("Reshape", b.dense("footholds.keep", leg), shape=[3 * policy.feet])
+        own = b.add("Add", own, b.add("Mul", b.add("Sigmoid", keep), last))
     return b.mix(b.add("Sigmoid", share), rest, own)
 
 

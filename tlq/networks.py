@@ -34,11 +34,24 @@ SAME_SIDE = np.array(
 """Order of the 100 heights in which the right legs' (RF, RR) are those of left legs in the mirror."""
 RESIDUALS = slice(2, tg.ACTION_SIZE)
 """Of an action [δf, δh, 12 residuals]."""
+
+
+def _last() -> slice:
+    start = 0
+    for name, size in tg.core.layout(heights=False):
+        if name == "actions":
+            break
+        start += size
+    return slice(start + RESIDUALS.start, start + RESIDUALS.stop)
+
+
+LAST = _last()
+"""Of the quadruped's 'state', the residuals of the last action, in [-1, 1]."""
 LEG_SIGN = np.array([[1, 1, 1], [-1, 1, 1]] * 2, np.float32)
 """(4, 3) turns a left leg's residuals (abduction, hip, knee) into the same leg's."""
 
 
-BEFORE = {"foothold_head": 0}
+BEFORE = {"foothold_head": 0, "foothold_keep": False}
 """Settings that older runs don't name, as they were."""
 
 
@@ -73,6 +86,9 @@ class NetworkConfig:
     foothold_head: int = 64
     """Width of the layers of a network of its own that takes over the residuals where feet must be led to footholds.
     There is one where the terrain has pits and a scripted guide teaches it (`ppo.guide`). 0: none."""
+    foothold_keep: bool = True
+    """That network says by how much to change the last action's residuals, a share of which it keeps; false: it says
+    all of them anew."""
     feet: int = 4
     """Feet whose heights stand at the end of the observation."""
 
@@ -123,6 +139,8 @@ def _head_bias(initial_std: float, min_std: float) -> Callable[..., jax.Array]:
 
 SMALL = nn.initializers.variance_scaling(0.01**2, "fan_in", "truncated_normal")
 """Of layers that give actions."""
+KEPT = 1.0
+"""Logit of the share of the last residuals that it keeps."""
 UNLED = -2.0
 """Logit of the share that an untrained part for footholds has in the residuals."""
 
@@ -162,9 +180,11 @@ class Footholds(nn.Module):
     config: NetworkConfig
 
     @nn.compact
-    def __call__(self, proprio: jax.Array, heights: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Normalised proprio (.., S - 100), heights (.., 100) -> its own residual actions (.., 12) before tanh, and the
-        shares g (.., 12).
+    def __call__(
+        self, proprio: jax.Array, heights: jax.Array, last: jax.Array | None
+    ) -> tuple[jax.Array, jax.Array]:
+        """Normalised proprio (.., S - 100), heights (.., 100), residuals (.., 12) of the last action, if it is to start
+        from them -> its own residual actions (.., 12) before tanh, and the shares g (.., 12).
         """
         c = self.config
         foot = _feet(c, heights)
@@ -174,6 +194,9 @@ class Footholds(nn.Module):
         own, leg = _legs(c, c.foothold_head, pair, context)
         share = Dense(3, kernel_init=SMALL, bias_init=nn.initializers.constant(UNLED), name="share")(leg)
         share = nn.sigmoid(share.reshape(own.shape))
+        if last is not None:
+            keep = Dense(3, kernel_init=SMALL, bias_init=nn.initializers.constant(KEPT), name="keep")(leg)
+            own = own + nn.sigmoid(keep.reshape(own.shape)) * last
         return own, share
 
 
@@ -196,9 +219,10 @@ class Policy(nn.Module):
         carry: jax.Array,
         is_first: jax.Array,
         footholds: dict[str, jax.Array] | None = None,
+        last: jax.Array | None = None,
     ) -> dict[str, Any]:
-        """proprio (.., S - 100), heights (.., 100) or None, carry (B, C) from before the first step, is_first (.., 1);
-        .. is (B,) for a step, (T, B) for a scan.
+        """proprio (.., S - 100), heights (.., 100) or None, carry (B, C) from before the first step, is_first (.., 1),
+        last: residuals (.., 12) of the last action or None; .. is (B,) for a step, (T, B) for a scan.
 
         Returns {'action': (.., 2 A), 'carry': (B, C) after the last step}, and with a part for footholds 'footholds':
         'rest' (.., 12), the residuals' means without it, 'own' (.., 12), its own, and 'share' (.., 12), how much of
@@ -229,7 +253,7 @@ class Policy(nn.Module):
             return {"action": action, "carry": carry}
         rest = action[..., RESIDUALS]
         if footholds is None:
-            own, share = Footholds(c, name="footholds")(proprio, heights)
+            own, share = Footholds(c, name="footholds")(proprio, heights, last)
         else:
             own, share = footholds["own"], footholds["share"]
         return {
@@ -293,20 +317,26 @@ def make_networks(
     """
     state_size, value_size = _size(observation_size["state"]), _size(observation_size["privileged_state"])
     size = carry_size(config.memory, config.memory_layers, config.memory_width)
+    keeps = config.foothold_head > 0 and config.foothold_keep and heights > 0
     policy, critic = Policy(config, action_size), Critic(config.critic)
 
     def split(state: jax.Array) -> tuple[jax.Array, jax.Array | None]:
         proprio = state_size - heights
         return state[..., :proprio], state[..., proprio:] if heights else None
 
+    def last(state: jax.Array) -> jax.Array | None:
+        return state[..., LAST] if keeps else None
+
     def policy_init(key: jax.Array) -> Any:
-        return policy.init(key, *split(jnp.zeros((1, state_size))), jnp.zeros((1, size)), jnp.zeros((1, 1)))
+        state = jnp.zeros((1, state_size))
+        return policy.init(key, *split(state), jnp.zeros((1, size)), jnp.zeros((1, 1)), None, last(state))
 
     def policy_apply(statistics: Any, params: Any, obs: dict[str, jax.Array]) -> dict[str, jax.Array]:
         proprio, _ = split(_normalised(preprocess_observations_fn, statistics, obs, "state"))
         carry = obs["carry"] if proprio.ndim == 2 else obs["carry"][0]
         heights = split(obs["state"])[1]
-        return policy.apply(params, proprio, heights, carry, obs["is_first"], obs.get("footholds"))
+        given = obs.get("footholds")
+        return policy.apply(params, proprio, heights, carry, obs["is_first"], given, last(obs["state"]))
 
     def value_apply(statistics: Any, params: Any, obs: dict[str, jax.Array]) -> jax.Array:
         return critic.apply(
@@ -315,7 +345,7 @@ def make_networks(
 
     def footholds_apply(statistics: Any, params: Any, state: jax.Array, rest: jax.Array) -> jax.Array:
         proprio, _ = split(_normalised(preprocess_observations_fn, statistics, {"state": state}, "state"))
-        own, share = Footholds(config).apply({"params": params}, proprio, split(state)[1])
+        own, share = Footholds(config).apply({"params": params}, proprio, split(state)[1], last(state))
         return _added(own, share, rest)
 
     return Networks(

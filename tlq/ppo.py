@@ -364,7 +364,7 @@ class Learner:
             piece, state.env_state, keys.reshape(-1, self.stride, *keys.shape[1:])
         )
         rollout, landings, metrics = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), results)
-        if guidance is not None:
+        if guidance is not None and landings is not None:
             errors = guide.next_errors(landings.missed, landings.landed, rollout.done)
             errors = jax.tree.map(lambda x: x[:: self.stride], errors)
             guidance = jax.vmap(jax.vmap(guide.with_errors))(guidance, *errors)

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from tests.tlq.toy import ACTIONS, ToyEnv
 from tlq import memory
 from tlq.memory import Memory, RecurrentWrapper, linear_scan
-from tlq.networks import CLIP, NetworkConfig, make_networks
+from tlq.networks import CLIP, LAST, NetworkConfig, make_networks
 
 T, B, W = 7, 3, 8
 KEY = jax.random.PRNGKey(0)
@@ -135,6 +135,8 @@ def statistics(obs, mean=0.0, std=1.0):
 @pytest.mark.parametrize("heights", [100, 0])
 def test_an_untrained_policy_acts_little_and_explores_as_configured(heights):
     obs = observation(heights=heights)
+    if heights:
+        obs["state"] = obs["state"].at[..., LAST].set(0.0)  # nothing done before, either
     networks = make_networks(
         {"state": 10 + heights, "privileged_state": 20}, ACTIONS, config=SMALL, heights=heights
     )
@@ -196,6 +198,11 @@ def test_footholds_take_over_a_share_of_the_residuals():
     taken_over = [networks.footholds(stats, alone, obs["state"], r) + r for r in (found["rest"], 3.0)]
     np.testing.assert_allclose(*taken_over, atol=1e-5)
     np.testing.assert_allclose(added, share * (taken_over[0] - found["rest"]), atol=1e-5)
+    # It goes on from the last action's residuals, as far as it keeps them.
+    moved = dict(obs, state=obs["state"].at[..., LAST].add(0.5))
+    fresh = jax.tree.map(jnp.zeros_like, own)
+    change = [networks.footholds(stats, fresh, o["state"], 0.0) for o in (obs, moved)]
+    np.testing.assert_allclose(change[1] - change[0], 0.5 * 0.5 * 0.5, atol=1e-6)  # both shares are a half
     # What they were in an earlier call replaces the network, whose parameters then don't matter.
     nothing = {"params": dict(params["params"], footholds=jax.tree.map(jnp.zeros_like, own))}
     again = networks.policy_network.apply(stats, nothing, dict(obs, footholds=found))

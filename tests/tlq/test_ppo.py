@@ -199,6 +199,9 @@ class Asking(Wrapper):
             held=jnp.array([[0.05, 0.0]] * 4),
             hold=jnp.array([1.0, 0.0, 0.0, 0.0]),
             last=jnp.array([[0.03, -0.09], [0.03, 0.09]]),
+            error=jnp.zeros((2, 2)),
+            known=jnp.ones(2),
+            mirror=jnp.float32(1.0),
         )
 
 
@@ -207,6 +210,40 @@ class Telling(Asking):
 
     def guidance(self, state):
         return super().guidance(state)._replace(ahead=state.obs["state"][:2])
+
+
+class Landing(Asking):
+    """Its feet come down one after the other, and miss their places by their number and the episode's steps."""
+
+    def followed(self, state):
+        clock = state.info["clock"]
+        missed = jnp.arange(4.0)[:, None] + jnp.stack([jnp.float32(clock), 0.0])
+        landings = guide.Landings(
+            jnp.zeros((4, 2)), jnp.zeros(4, jnp.int32), jnp.arange(4) == clock % 6, missed
+        )
+        return state.replace(info=state.info | {"landings": landings})
+
+    def reset(self, key):
+        state = self.env.reset(key)
+        return self.followed(state.replace(info=state.info | {"clock": jnp.int32(0)}))
+
+    def step(self, state, action):
+        after = self.env.step(state, action)
+        return self.followed(after.replace(info=after.info | {"clock": state.info["clock"] + 1}))
+
+
+def test_the_guide_knows_afterwards_how_feet_came_down():
+    learner = make_learner(env=Landing(ToyEnv(length=1000)), foothold_head=16)
+    parts = learner.batch(learner.init(0))
+    unroll, stride = len(parts["reward"]), learner.stride
+    whole = ~np.asarray(parts["done"]).any(axis=0)
+    assert whole.any()
+    for i, leg in ((i, leg) for i in range(unroll // stride) for leg in (1, 2)):
+        # The step from clock c leads to c + 1.
+        clock = next((c for c in range(stride * i + 1, unroll + 1) if c % 6 == leg), None)
+        assert np.all(parts["guide_known"][i, whole, leg - 1] == (clock is not None))
+        if clock is not None:
+            assert np.all(parts["guide_error"][i, whole, leg - 1] == np.array([leg + clock, leg]))
 
 
 @pytest.mark.parametrize(("head", "unroll", "every"), [(16, 10, 5), (16, 12, 4), (16, 7, 1), (0, 10, 1)])
@@ -257,7 +294,7 @@ def test_a_policy_learns_where_its_guide_sees_ground(head):
 
 @pytest.mark.slow
 def test_the_guide_teaches_the_footholds_and_reward_the_rest():
-    """Each at its own rate, and neither touches what the other learns."""
+    """Each at its own rate, and neither touches what the other learns, unless PPO is to train both."""
     env = Asking(ToyEnv(length=5))
 
     def changed(**rates):
@@ -277,6 +314,8 @@ def test_the_guide_teaches_the_footholds_and_reward_the_rest():
     assert by_reward.pop("footholds") == 0 and min(by_reward.values()) > 0
     by_guide = changed(learning_rate=0.0, guide_rate=1e-3)
     assert by_guide.pop("footholds") > 5e-4 and max(by_guide.values()) == 0
+    both = changed(learning_rate=1e-3, guide_rate=0.0, train_footholds=True)
+    assert min(both.values()) > 0
 
 
 @pytest.mark.slow
