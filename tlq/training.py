@@ -254,6 +254,12 @@ def initialise(state: TrainState, source: str, config: TrainConfig | None = None
         raise ValueError(f"init={source} doesn't fit: it has a part for footholds, which needs {needs}")
     parts = jax.tree.unflatten(jax.tree.structure(parts), flat)
     print(f"init: {len(taken)} of {len(flat)} arrays from {source}", flush=True)
+    if afresh and owned and any(".footholds." in name for name in arrays):
+        print(
+            "init: its part for footholds is of another shape and learns anew; "
+            "see policy.foothold_head, foothold_keep",
+            flush=True,
+        )
     rate = state.learning_rate
     if config is not None and config.ppo.kl_target > 0:
         rate = jax.device_put(np.float32(config.ppo.learning_rate_min), rate.sharding)

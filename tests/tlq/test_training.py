@@ -247,13 +247,14 @@ def started(head, file):
 
 
 @pytest.mark.parametrize("some", [False, True])
-def test_footholds_are_new_to_a_policy_from_before(some, learner, tmp_path):
+def test_footholds_are_new_to_a_policy_from_before(some, learner, tmp_path, capsys):
     """They begin as untrained ones do, all of them if some are new; the rest is the old policy's."""
     state = learner.init(0)
     arrays = dict(zip(names(state), map(np.asarray, jax.tree.leaves(state)), strict=True))
     arrays |= {"params.policy.params.footholds.leg.bias": np.ones(8)} if some else {}
     np.savez(tmp_path / "policy.npz", **{n: x for n, x in arrays.items() if n.startswith("params.policy")})
     fresh, taken = started(8, tmp_path / "policy.npz")
+    assert ("learns anew" in capsys.readouterr().out) == some
     jax.tree.map(np.testing.assert_array_equal, taken["footholds"], fresh["footholds"])
     jax.tree.map(np.testing.assert_array_equal, taken["mix"], state.params.policy["params"]["mix"])
     assert (taken["mix"]["kernel"] != fresh["mix"]["kernel"]).any()
