@@ -92,6 +92,12 @@ def layout(heights: bool) -> tuple[tuple[str, int], ...]:
     return (*parts, ("heights", 100)) if heights else tuple(parts)
 
 
+def offset(part: str) -> int:
+    """Where a part of the observation begins."""
+    names, sizes = zip(*layout(heights=True), strict=True)
+    return sum(sizes[: names.index(part)])
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class Core:
     """Trajectory generator, observation and joint targets of one robot. All methods are pure."""

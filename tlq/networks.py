@@ -36,16 +36,7 @@ RESIDUALS = slice(2, tg.ACTION_SIZE)
 """Of an action [δf, δh, 12 residuals]."""
 
 
-def _last() -> slice:
-    start = 0
-    for name, size in tg.core.layout(heights=False):
-        if name == "actions":
-            break
-        start += size
-    return slice(start + RESIDUALS.start, start + RESIDUALS.stop)
-
-
-LAST = _last()
+LAST = slice(tg.core.offset("actions") + RESIDUALS.start, tg.core.offset("actions") + RESIDUALS.stop)
 """Of the quadruped's 'state', the residuals of the last action, in [-1, 1]."""
 LEG_SIGN = np.array([[1, 1, 1], [-1, 1, 1]] * 2, np.float32)
 """(4, 3) turns a left leg's residuals (abduction, hip, knee) into the same leg's."""

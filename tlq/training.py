@@ -286,12 +286,7 @@ def rescale_residuals(arrays: dict[str, np.ndarray], ratio: float) -> dict[str, 
     """
     arrays, residual = dict(arrays), RESIDUALS
     spread = slice(tg.ACTION_SIZE + RESIDUALS.start, 2 * tg.ACTION_SIZE)
-    start = 0
-    for name, size in tg.core.layout(heights=False):
-        if name == "actions":
-            break
-        start += size
-    seen = start + np.arange(2 * tg.ACTION_SIZE).reshape(2, -1)[:, residual].reshape(-1)
+    seen = tg.core.offset("actions") + np.arange(2 * tg.ACTION_SIZE).reshape(2, -1)[:, residual].reshape(-1)
     for name, x in arrays.items():
         x = np.array(x)
         if name.endswith("params.action.kernel"):
