@@ -57,6 +57,9 @@ class Options:
     retraction: float = cli.option(-1.0, "share of retraction of the feet; negative: the policy's own")
     frequency: float = cli.option(0.0, "gait cycles per second at action 0 (Hz); 0: the policy's own")
     step_length: float = cli.option(0.0, "of the gait (m); 0: the policy's own")
+    touch_down: float = cli.option(
+        -1.0, "share of the trunk's motion that swing leaves out; negative: the policy's"
+    )
     robots: int = cli.option(96, "episodes, two on each terrain")
     seconds: float = cli.option(8.0, "longest episode")
     json: str = cli.option("", "file for the result")
@@ -69,6 +72,7 @@ def make_env(policy: Policy, options: Options) -> envs.QuadrupedEnv:
         "tg.retraction": options.retraction if options.retraction >= 0 else own.tg.retraction,
         "tg.base_frequency": options.frequency or own.tg.base_frequency,
         "tg.step_length": options.step_length or own.tg.step_length,
+        "tg.touch_down": options.touch_down if options.touch_down >= 0 else own.tg.touch_down,
     }
     config = settings.changed(
         own,

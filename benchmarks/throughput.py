@@ -65,17 +65,27 @@ class Environments:
     """Environments without the policy: a function that makes some steps.
 
     guided: as in training, where a scripted guide to footholds is asked what it says.
+    bank: of the same kind and number of terrains, if there is one already; it takes half a minute.
     """
 
-    def __init__(self, kind: str, num_envs: int, num_terrains: int, guided: bool = False):
+    def __init__(
+        self,
+        kind: str,
+        num_envs: int,
+        num_terrains: int,
+        guided: bool = False,
+        bank: terrains.Bank | None = None,
+    ):
         changes = {"env.terrain.kind": kind, "env.terrain.num_terrains": num_terrains, "num_envs": num_envs}
         if not guided:
             changes["ppo.guide"] = 0.0
         self.config = settings.changed(settings.default_config(), changes)
         settings.validate(self.config)
-        self.learner = make_learner(self.config)
+        made = envs.QuadrupedEnv(self.config.env, bank)
+        self.bank = made.bank
+        env = envs.AutoReset(made)
+        self.learner = make_learner(self.config, envs.Guided(env) if guided else env)
         self.state = self.learner.init(0)
-        self.bank: terrains.Bank = self.learner.env.unwrapped.bank
         self._run = timing.env_steps(self.learner, STEPS)
 
     def run(self) -> None:
@@ -177,7 +187,7 @@ def recorded(config: envs.EnvConfig, robots: int = 64) -> tuple[np.ndarray, np.n
 def compare(options: Options) -> dict[str, Any]:
     """The ratios, and the rates behind them."""
     plain = Environments("stepping_stones", options.num_envs, options.num_terrains)
-    stones = Environments("stepping_stones", options.num_envs, options.num_terrains, guided=True)
+    stones = Environments("stepping_stones", options.num_envs, options.num_terrains, True, plain.bank)
     c = MujocoC(stones.config.env, options.num_envs)
 
     def training() -> None:

@@ -205,7 +205,8 @@ def _target(env: QuadrupedEnv, episode: Episode) -> tuple[jax.Array, jax.Array]:
     core, controller, sensors = env.core, episode.controller, exact_sensors(episode)
     phase = tg.path.advance(controller.phase, controller.frequency, core.dt)
     lift = controller.lift * controller.gate
-    target = core.foot_targets(tg.path.leg_phases(phase), lift, controller.stride, sensors)
+    phases = tg.path.leg_phases(phase)
+    target = core.foot_targets(phases, lift, controller.stride, sensors, gate=controller.gate)
     return target, tg.frames.heading_from_trunk(tg.frames.up_in_trunk(sensors.orientation))
 
 

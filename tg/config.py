@@ -2,7 +2,14 @@
 
 import dataclasses
 
-BEFORE = {"look_ahead": False, "retraction": 0.0, "finish_step": False, "follow": False, "sample_radius": 0.1}
+BEFORE = {
+    "look_ahead": False,
+    "retraction": 0.0,
+    "finish_step": False,
+    "follow": False,
+    "sample_radius": 0.1,
+    "touch_down": 0.0,
+}
 """Settings of policies from before there was such a setting."""
 
 
@@ -57,6 +64,10 @@ class TGConfig:
     sample_radius: float = 0.1
     """Radius of the outer circle of height samples (m). In the middle of a gap twice as wide all samples are low, and
     say nothing of where the ground is."""
+    touch_down: float = 0.0
+    """Share of the trunk's rise, fall and tilt that is taken out of the height of feet in swing: 1 leads them to the
+    height of the feet in stance, so that they come down when the step ends, whatever the trunk does; 0, as in the
+    paper, to a height below their hips."""
     finish_step: bool = True
     """When told to stand, let feet in swing come down at the end of their step, and all feet stay there; false: the
     gait fades out where it is, and the feet come down, or are drawn, to below the hips."""

@@ -29,6 +29,11 @@ LAG = 0.07
 SMOOTHING = 0.3
 """Share of a new measurement in the velocity that the stance legs tell of."""
 
+SUNK = 0.06
+"""By how much (m) the height of feet in swing is corrected at most (`TGConfig.touch_down`)."""
+HANDED_BACK = 0.3
+"""Share of stance in which that is given up again."""
+
 _DOWN = 1e-3
 """Sine of the phase below which all feet are down."""
 
@@ -207,7 +212,7 @@ class Core:
         """How far residual joint angles lead the feet (4, 3) m from the trajectory generator's, heading frame."""
         xp = state.targets.__array_namespace__()
         phases = path.leg_phases(state.phase)
-        target = self.foot_targets(phases, state.lift * state.gate, state.stride, sensors)
+        target = self.foot_targets(phases, state.lift * state.gate, state.stride, sensors, gate=state.gate)
         level = frames.heading_from_trunk(frames.up_in_trunk(sensors.orientation))
         return (xp.reshape(state.targets[0], (4, 3)) - target) @ level.T
 
@@ -322,7 +327,7 @@ class Core:
 
         up = frames.up_in_trunk(sensors.orientation)
         level = frames.heading_from_trunk(up)
-        targets = self.foot_targets(phases, lift * gate, stride, sensors, level)
+        targets = self.foot_targets(phases, lift * gate, stride, sensors, level, gate)
         tg_angles = leg.inverse(self.geometry, targets)
         residual = c.residual_range * xp.reshape(action[2:], (4, 3))
         wanted = tg_angles + residual
@@ -364,7 +369,13 @@ class Core:
         return (state.gate > 0) & (xp.abs(xp.sin(state.phase)) > _DOWN)
 
     def foot_targets(
-        self, phases: Array, lift: Array, stride: Array, sensors: Sensors, level: Array | None = None
+        self,
+        phases: Array,
+        lift: Array,
+        stride: Array,
+        sensors: Sensors,
+        level: Array | None = None,
+        gate: Array | None = None,
     ) -> Array:
         """pos^d = [dx + X, dy + Y, dz + Z] of the paper, turned from the horizontal frame into the trunk's.
 
@@ -374,17 +385,39 @@ class Core:
           stride: (2,) direction in the heading frame; the step is L times as long.
           sensors: whose roll and pitch are taken out.
           level: (3, 3) `heading_from_trunk` of those, where it is known already.
+          gate: () share of the vertical motion; 1 if None.
 
         Returns:
           (4, 3) m from the abduction joints, trunk frame.
         """
         xp = phases.__array_namespace__()
-        along = path.stride(phases, self.config.retraction)[:, None] * (self.config.step_length * stride)
-        motion = xp.concatenate([along, (lift * path.height(phases))[:, None]], axis=-1)
+        c = self.config
+        along = path.stride(phases, c.retraction)[:, None] * (c.step_length * stride)
+        up = lift * path.height(phases)
         if level is None:
             level = frames.heading_from_trunk(frames.up_in_trunk(sensors.orientation))
+        if self.config.touch_down:
+            up = up + self.config.touch_down * self._sunk(phases, sensors, level, gate)
+        motion = xp.concatenate([along, up[:, None]], axis=-1)
         share = self.config.levelling
         return (share * self.base_foot + motion) @ level + (1.0 - share) * self.base_foot
+
+    def _sunk(self, phases: Array, sensors: Sensors, level: Array, gate: Array | None) -> Array:
+        """How much higher (4,) m than below a level trunk's hips feet in swing come down, 0 for feet in stance.
+
+        The ground is where the feet in stance are.
+        """
+        xp = phases.__array_namespace__()
+        gate = 1.0 + 0.0 * phases[0] if gate is None else gate
+        feet = leg.forward(self.geometry, xp.reshape(sensors.joint_position, (4, 3)))
+        heights = ((self.geometry.hip_position + feet) @ level.T)[:, 2]
+        ground = load_share(phases, gate) @ heights
+        standing = (self.geometry.hip_position @ level.T + self.base_foot)[:, 2]
+        sunk = xp.clip(ground - standing, -SUNK, SUNK)
+        # Taken up in the first half of swing, given back early in stance: there legs are to push a trunk back.
+        u = xp.where(phases > 0, 2.0 * phases, (math.pi + phases) / HANDED_BACK) / math.pi
+        share = path.smoothstep(xp.clip(u, 0.0, 1.0))
+        return gate * xp.where(phases > 0, share, 1.0 - share) * sunk
 
     def update_mirror(self, mirror: Array, command: Array) -> Array:
         """+1 for commands to the left, -1 to the right, with hysteresis around straight ahead."""

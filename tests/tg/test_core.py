@@ -183,6 +183,33 @@ def test_levelling_scales_how_much_of_the_tilt_is_taken_out(subject):
     np.testing.assert_allclose(targets[0.5], (targets[0.0] + targets[1.0]) / 2)
 
 
+@pytest.mark.parametrize("tilt", [0.0, 0.1])
+def test_feet_come_down_where_the_feet_in_stance_are_whatever_the_trunk_does(subject, tilt):
+    """A trunk 2 cm too low, and tilted: at the end of the step LF and RR are led to the height of the other feet."""
+    core, plain = (subject.make(np.float64, touch_down=share) for share in (1.0, 0.0))
+    quaternion = np.array([math.cos(tilt / 2), 0.6 * math.sin(tilt / 2), 0.8 * math.sin(tilt / 2), 0])
+    level = tg.frames.heading_from_trunk(tg.frames.up_in_trunk(quaternion))
+    hips = core.geometry.hip_position
+    # All feet on one level plane 26 cm below the trunk's centre for its 28 cm.
+    down = (hips + core.base_foot @ level) @ level.T
+    down[:, 2] = core.base_foot[:, 2] + 0.02
+    angles = tg.leg.inverse(core.geometry, down @ level - hips).reshape(12)
+    sensors = level_sensors(core)._replace(orientation=quaternion, joint_position=angles)
+
+    def heights(of, phase, gate=1.0):
+        found = of.foot_targets(
+            tg.path.leg_phases(np.asarray(phase)), np.zeros(4), STAND, sensors, gate=np.asarray(gate)
+        )
+        return ((hips + found) @ level.T)[:, 2]
+
+    np.testing.assert_allclose(heights(core, np.pi - 1e-9)[[0, 3]], down[[0, 3], 2], atol=1e-6)
+    # Up to the last third of stance the legs are as without, and push the trunk back.
+    np.testing.assert_allclose(heights(core, 0.4 * np.pi)[[1, 2]], heights(plain, 0.4 * np.pi)[[1, 2]])
+    np.testing.assert_allclose(heights(core, 0.7 * np.pi, gate=0.0), heights(plain, 0.7 * np.pi))
+    cycle = np.array([heights(core, p) for p in tg.path.wrap(np.linspace(0, 2 * np.pi, 2001))])
+    assert np.abs(np.diff(cycle, axis=0)).max() < 3e-4
+
+
 def test_residuals_add_to_the_angles_and_limits_hold(subject):
     core = subject.make(np.float64, weight_compensation=0.0)
     state, sensors = core.initial_state(np.asarray(0.5 * np.pi)), level_sensors(core)
