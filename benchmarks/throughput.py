@@ -65,7 +65,7 @@ class Environments:
     """Environments without the policy: a function that makes some steps.
 
     guided: as in training, where a scripted guide to footholds is asked what it says.
-    bank: of the same kind and number of terrains, if there is one already; it takes half a minute.
+    bank: of the same kind and number of terrains, if there is one already: building it takes longer than measuring.
     """
 
     def __init__(

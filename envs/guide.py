@@ -69,10 +69,6 @@ ARRIVED = 1.5
 """Phase (rad) from which it is led all the way to its place; a share of it before: joints that jump upset the trunk."""
 
 
-MIRROR_LEGS = np.array([1, 0, 3, 2], np.int32)
-"""The leg that each leg is in the mirror."""
-
-
 def places() -> np.ndarray:
     """(SIDE^2, 2) m, where a foot may be sent from the end of its step."""
     return _square(REACH).reshape(-1, 2)
@@ -287,7 +283,7 @@ def _lead(env: QuadrupedEnv, episode: Episode) -> tuple[jax.Array, jax.Array]:
 
 def _mirrored(guidance: Guidance) -> Guidance:
     """In the mirror left is right, and the abduction joints turn the other way."""
-    side, swapped = jnp.array([1.0, -1.0]), jnp.asarray(MIRROR_LEGS)
+    side, swapped = jnp.array([1.0, -1.0]), jnp.array(tg.core.MIRRORED_LEG, jnp.int32)
     return Guidance(
         lead=guidance.lead[swapped] * jnp.array([[-1.0, 1.0, 1.0, 1.0], [1.0, -1.0, -1.0, -1.0]]),
         legs=swapped[guidance.legs],
@@ -316,7 +312,7 @@ def with_errors(guidance: Guidance, error: jax.Array, known: jax.Array) -> Guida
       error: (4, 2) m, how far from where they were led the feet came down next, heading frame, the robot's own sides.
       known: (4,) whether that is known.
     """
-    swapped = jnp.asarray(MIRROR_LEGS)
+    swapped = jnp.array(tg.core.MIRRORED_LEG, jnp.int32)
     own = jnp.where(guidance.mirror > 0, guidance.legs, swapped[guidance.legs])
     side = jnp.stack([jnp.ones_like(guidance.mirror), guidance.mirror])
     return guidance._replace(error=error[own] * side, known=known[own].astype(jnp.float32))

@@ -37,7 +37,8 @@ HANDED_BACK = 0.3
 _DOWN = 1e-3
 """Sine of the phase below which all feet are down."""
 
-_MIRRORED_LEG = (1, 0, 3, 2)
+MIRRORED_LEG = (1, 0, 3, 2)
+"""The leg that each leg is in the mirror."""
 
 
 class Sensors(NamedTuple):
@@ -396,14 +397,14 @@ class Core:
         up = lift * path.height(phases)
         if level is None:
             level = frames.heading_from_trunk(frames.up_in_trunk(sensors.orientation))
-        if self.config.touch_down:
-            up = up + self.config.touch_down * self._sunk(phases, sensors, level, gate)
+        if c.touch_down:
+            up = up + c.touch_down * self._sunk(phases, sensors, level, gate)
         motion = xp.concatenate([along, up[:, None]], axis=-1)
-        share = self.config.levelling
+        share = c.levelling
         return (share * self.base_foot + motion) @ level + (1.0 - share) * self.base_foot
 
     def _sunk(self, phases: Array, sensors: Sensors, level: Array, gate: Array | None) -> Array:
-        """How much higher (4,) m than below a level trunk's hips feet in swing come down, 0 for feet in stance.
+        """How much higher (4,) m than below a level trunk's hips feet in swing come down; it fades out early in stance.
 
         The ground is where the feet in stance are.
         """
@@ -491,7 +492,7 @@ _KIND = {
 
 def _legwise(points: list[int], signs: tuple[float, ...]) -> tuple[list[int], list[float]]:
     size = len(points)
-    index = [other * size + p for other in _MIRRORED_LEG for p in points]
+    index = [other * size + p for other in MIRRORED_LEG for p in points]
     return index, list(signs) * (4 * size // len(signs))
 
 

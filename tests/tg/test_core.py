@@ -203,7 +203,7 @@ def test_feet_come_down_where_the_feet_in_stance_are_whatever_the_trunk_does(sub
         return ((hips + found) @ level.T)[:, 2]
 
     np.testing.assert_allclose(heights(core, np.pi - 1e-9)[[0, 3]], down[[0, 3], 2], atol=1e-6)
-    # Up to the last third of stance the legs are as without, and push the trunk back.
+    # After the first third of stance the legs are as without, and push the trunk back.
     np.testing.assert_allclose(heights(core, 0.4 * np.pi)[[1, 2]], heights(plain, 0.4 * np.pi)[[1, 2]])
     np.testing.assert_allclose(heights(core, 0.7 * np.pi, gate=0.0), heights(plain, 0.7 * np.pi))
     cycle = np.array([heights(core, p) for p in tg.path.wrap(np.linspace(0, 2 * np.pi, 2001))])
