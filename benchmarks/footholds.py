@@ -56,6 +56,8 @@ class Options:
     reflex: bool = cli.option(False, "lead the feet by the reflex")
     retraction: float = cli.option(-1.0, "share of retraction of the feet; negative: the policy's own")
     frequency: float = cli.option(0.0, "gait cycles per second at action 0 (Hz); 0: the policy's own")
+    gait: str = cli.option("", "trot or walk; empty: the policy's own")
+    swing_share: float = cli.option(0.0, "of the gait's cycle; 0: the policy's own")
     step_length: float = cli.option(0.0, "of the gait (m); 0: the policy's own")
     touch_down: float = cli.option(
         -1.0, "share of the trunk's motion that swing leaves out; negative: the policy's"
@@ -71,6 +73,8 @@ def make_env(policy: Policy, options: Options) -> envs.QuadrupedEnv:
     gait = {
         "tg.retraction": options.retraction if options.retraction >= 0 else own.tg.retraction,
         "tg.base_frequency": options.frequency or own.tg.base_frequency,
+        "tg.gait": options.gait or own.tg.gait,
+        "tg.swing_share": options.swing_share or own.tg.swing_share,
         "tg.step_length": options.step_length or own.tg.step_length,
         "tg.touch_down": options.touch_down if options.touch_down >= 0 else own.tg.touch_down,
     }
@@ -98,7 +102,7 @@ def lead(env: envs.QuadrupedEnv, episode: envs.Episode, led: jax.Array) -> jax.A
     A foot that has landed is held there: let go at once it would push the trunk.
     """
     wished, asked = guide.displacements(env, episode)
-    phases = tg.path.leg_phases(episode.controller.phase)[:, None]
+    phases = env.core.phases(episode.controller.phase)[:, None]
     kept = jnp.where((phases > 0) & (phases < LET_GO), KEPT * led, led)
     return jnp.where(asked[:, None], wished, kept)
 
@@ -126,7 +130,7 @@ def step(
     before, episode = episode, state.pipeline_state
     _, around = env._terrain_at_feet(episode)
     over = jnp.max(around, axis=1) - around[:, 0] > env.config.rewards.gap_threshold
-    stance = tg.path.leg_phases(episode.controller.phase) <= 0
+    stance = env.core.phases(episode.controller.phase) <= 0
     mirror = env.core.update_mirror(before.controller.mirror, env.heading_command(before))
     residual = env.core.mirror_action(mirror, action)[2:].reshape(4, 3)
     shown = {
@@ -135,7 +139,7 @@ def step(
         "progress": episode.progress,
         "over": jnp.sum(over & stance),
         "stance": jnp.sum(stance),
-        "swing": tg.path.leg_phases(before.controller.phase) > 0,
+        "swing": env.core.phases(before.controller.phase) > 0,
         "swing_after": ~stance,
         "at_limit": jnp.any(jnp.abs(residual) > AT_LIMIT, axis=-1),
         "said": in_world(before, env.landing_points(before)),

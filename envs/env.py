@@ -251,7 +251,7 @@ class QuadrupedEnv(Env):
         after = after.replace(
             # fmax: where the physics exploded, what was reached before stays.
             progress=jnp.fmax(before.progress, (after.qpos[:2] - after.origin) @ after.command),
-            lift_off=jnp.where(tg.path.leg_phases(controller.phase) > 0, before.lift_off, around[:, 0]),
+            lift_off=jnp.where(self.core.phases(controller.phase) > 0, before.lift_off, around[:, 0]),
         )
         terms = self._reward_terms(before, after, below, around)
         reward, weighted = rewards.total(self.config.rewards, terms)
@@ -302,7 +302,7 @@ class QuadrupedEnv(Env):
         counts = walked & ~episode.practice & (episode.level == level)  # not what was revisited
         up = counts & ~fell & (episode.progress > c.up * reachable)
         down = counts & (episode.progress < c.down * reachable)
-        return jnp.clip(level + up.astype(jnp.int32) - down.astype(jnp.int32), 0, self.levels - 1)
+        return jnp.clip(level + c.leap * up.astype(jnp.int32) - down.astype(jnp.int32), 0, self.levels - 1)
 
     # -- senses
 
@@ -514,7 +514,7 @@ class QuadrupedEnv(Env):
             desired=after.controller.desired,
             previous=before.controller.desired,
             energy=rewards.energy(after.torque, after.qvel[6:], literal=c.literal),
-            swing=(tg.path.leg_phases(after.controller.phase) > 0)
+            swing=(self.core.phases(after.controller.phase) > 0)
             & self.core.stepping(after.controller, self.told(before)),
             near=below[:, self._near],
             highest=jnp.min(below, axis=1),
@@ -550,7 +550,7 @@ class QuadrupedEnv(Env):
         offsets = jnp.asarray(tg.samples.ring_offsets(self.config.tg.sample_radius)[self._near], jnp.float32)
         there = self._heights(episode, self.landing_points(episode)[:, None] + offsets) + episode.qpos[2]
         highest = jnp.maximum(jnp.max(around, axis=1), jnp.max(there, axis=1))
-        swing = tg.path.leg_phases(episode.controller.phase) > 0
+        swing = self.core.phases(episode.controller.phase) > 0
         swing &= self.stepping(episode)
         return rewards.terrain(swing, -there, -highest, self.config.rewards.gap_threshold, graded=True)
 
@@ -598,6 +598,12 @@ def check(config: EnvConfig) -> None:
     """Raises ValueError on a configuration that makes no sense."""
     if config.method not in METHODS:
         raise ValueError(f"unknown method '{config.method}'; choose one of {', '.join(METHODS)}")
+    gait, share = config.tg.gait, config.tg.swing_share
+    if gait not in tg.path.GAITS:
+        raise ValueError(f"unknown gait '{gait}'; choose one of {', '.join(tg.path.GAITS)}")
+    if share > tg.path.LONGEST_SWING[gait]:
+        longest = tg.path.LONGEST_SWING[gait]
+        raise ValueError(f"tg.swing_share={share} must be at most {longest} with tg.gait={gait}")
     if config.dynamics not in DYNAMICS:
         raise ValueError(f"unknown dynamics '{config.dynamics}'; choose one of {', '.join(DYNAMICS)}")
     check_limits(config)

@@ -115,15 +115,15 @@ class Steps(NamedTuple):
 def steps(env: QuadrupedEnv, episode: Episode) -> Steps:
     """The steps that an episode's feet are about to end."""
     controller, sensors = episode.controller, exact_sensors(episode)
-    phases = tg.path.leg_phases(controller.phase)
-    _, legs = jax.lax.top_k(phases, 2)  # a trot has no more in swing
+    phases = env.core.phases(controller.phase)
+    _, legs = jax.lax.top_k(phases, 2)  # no gait has more in swing
     ends = env.step_ends(episode)[legs]
     gaps = gap_shares(env, episode, ends)
     share = tg.path.smoothstep(jnp.clip((phases[legs] - LIFTING) / (ARRIVED - LIFTING), 0.0, 1.0))
     now = env.core.residual_displacement(controller, sensors)[legs, :2] / jnp.maximum(share, FIRST)[:, None]
     now = jnp.clip(now, -REACH * CELL, REACH * CELL)
     # The mean speed of feet in stance.
-    speed = 2.0 * controller.frequency * env.core.config.step_length
+    speed = env.core.stance_speed(controller.frequency)
     ahead = jnp.clip(BALANCE * (env.velocity(episode) - speed * controller.stride), -AWAY, AWAY)
     danger = jnp.maximum(between(gaps, now), gaps[:, REACH, REACH]) > SAFE
     stepping = env.stepping(episode)
@@ -157,12 +157,15 @@ def displacements(env: QuadrupedEnv, episode: Episode) -> tuple[jax.Array, jax.A
     away = jnp.linalg.norm(s.now[:, None] - places(), axis=-1)
     far = jnp.linalg.norm(s.ahead - places(), axis=-1)
     cost = s.gaps.reshape(2, -1) + FARTHER * far + ANOTHER * away
-    best = _best_pair(cost, s.ahead, s.ends[0] - s.ends[1])
+    together = jnp.all(env.core.phases(episode.controller.phase)[s.legs] > 0)
+    best = _best_pair(cost, s.ahead, s.ends[0] - s.ends[1], jnp.where(together, ACROSS, 0.0))
     led = jnp.zeros((4, 2)).at[s.legs].set(s.share[:, None] * best)
     return led, jnp.zeros(4, bool).at[s.legs].set(s.asked)
 
 
-def _best_pair(cost: jax.Array, ahead: jax.Array, line: jax.Array) -> jax.Array:
+def _best_pair(
+    cost: jax.Array, ahead: jax.Array, line: jax.Array, across: jax.Array | float = ACROSS
+) -> jax.Array:
     """The places (2, 2) m of the two feet that cost least together.
 
     On two feet a robot topples across the line between them, not along it: what counts is how far the middle of that
@@ -172,11 +175,12 @@ def _best_pair(cost: jax.Array, ahead: jax.Array, line: jax.Array) -> jax.Array:
       cost: (2, N) of each place for each foot alone.
       ahead: (2,) m, the displacement that balance wants.
       line: (2,) m, between the ends of the two steps.
+      across: what it costs to move the middle of that line across by a metre; 0 if one of the feet isn't in swing.
     """
     least, which = jax.lax.top_k(-cost, CANDIDATES)
     at = jnp.asarray(places(), jnp.float32)[which]
     off = (at - ahead) @ _across(line)
-    together = -least[0][:, None] - least[1] + ACROSS * jnp.abs(off[0][:, None] + off[1]) / 2
+    together = -least[0][:, None] - least[1] + across * jnp.abs(off[0][:, None] + off[1]) / 2
     first, second = jnp.unravel_index(jnp.argmin(together), together.shape)
     return jnp.stack([at[0, first], at[1, second]])
 
@@ -201,7 +205,7 @@ def _target(env: QuadrupedEnv, episode: Episode) -> tuple[jax.Array, jax.Array]:
     core, controller, sensors = env.core, episode.controller, exact_sensors(episode)
     phase = tg.path.advance(controller.phase, controller.frequency, core.dt)
     lift = controller.lift * controller.gate
-    phases = tg.path.leg_phases(phase)
+    phases = core.phases(phase)
     target = core.foot_targets(phases, lift, controller.stride, sensors, gate=controller.gate)
     return target, tg.frames.heading_from_trunk(tg.frames.up_in_trunk(sensors.orientation))
 
@@ -242,7 +246,7 @@ def guide(env: QuadrupedEnv, episode: Episode, held: jax.Array) -> Guidance:
     held: (4, 2) m, of `Guided`.
     """
     s, controller = steps(env, episode), episode.controller
-    stance = tg.path.leg_phases(controller.phase) <= 0
+    stance = env.core.phases(controller.phase) <= 0
     lead, last = _lead(env, episode)
     own = Guidance(
         lead=lead,
@@ -405,7 +409,7 @@ class Guided(Wrapper):
         episode: Episode = state.pipeline_state
         controller, sensors = episode.controller, exact_sensors(episode)
         now = env.core.residual_displacement(controller, sensors)[:, :2]
-        swing = tg.path.leg_phases(controller.phase) > 0
+        swing = env.core.phases(controller.phase) > 0
         held = jnp.where(swing[:, None], held + SMOOTHING * (now - held), held)
         yaw = tg.frames.yaw(episode.qpos[3:7])
         led = episode.qpos[:2] + tg.frames.turn(yaw, env.step_ends(episode) + now)

@@ -9,6 +9,8 @@ BEFORE = {
     "follow": False,
     "sample_radius": 0.1,
     "touch_down": 0.0,
+    "swing_share": 0.5,
+    "gait": "trot",
 }
 """Settings of policies from before there was such a setting."""
 
@@ -25,6 +27,12 @@ class TGConfig:
     """f_base, gait cycles per second at action 0 (Hz)."""
     frequency_range: float = 0.5
     """δf at action ±1 (Hz)."""
+    gait: str = "trot"
+    """trot (the paper's: diagonal legs together) or walk (one after the other, three feet down; with a `swing_share` of
+    at most 0.24)."""
+    swing_share: float = 0.5
+    """Share of the gait cycle that a leg is in swing. The paper's is 0.5; below it all feet are down for a while between
+    the two pairs' swings, and the trunk can be brought back to level."""
     step_length: float = 0.16
     """L, the stride from lift-off to touch-down (m). 0 leaves only the vertical motion (the fixed-height baseline)."""
     retraction: float = 1.0

@@ -144,6 +144,14 @@ class Core:
         )
         return (pose + leg.support_torque(self.geometry, pose, load)).reshape(-1)
 
+    def phases(self, phase: Array) -> Array:
+        """Phases (..., 4) rad of the legs from the gait's (...) rad: `path.leg_phases`."""
+        return path.leg_phases(phase, self.config.swing_share, self.config.gait)
+
+    def stance_speed(self, frequency: Array) -> Array:
+        """Mean speed (...) m/s of feet in stance, against the trunk, at a frequency (...) Hz."""
+        return frequency * (self.config.step_length / (1.0 - self.config.swing_share))
+
     def initial_state(self, phase: Array) -> ControllerState:
         """A standing robot's state, its gait to start at a phase () rad."""
         xp = phase.__array_namespace__()
@@ -184,7 +192,7 @@ class Core:
         if self.config.follow:
             ends = ends + self.residual_displacement(state, sensors)[:, :2]
         # A robot that stands still has feet in swing by their phase, but they stay where they are.
-        share = xp.where(path.leg_phases(state.phase) > 0, state.gate, 0.0 * state.gate)[:, None]
+        share = xp.where(self.phases(state.phase) > 0, state.gate, 0.0 * state.gate)[:, None]
         return feet + share * (ends - feet)
 
     def around(self, centres: Array) -> Array:
@@ -200,7 +208,7 @@ class Core:
         q, speed = (xp.reshape(x, (4, 3)) for x in (sensors.joint_position, sensors.joint_velocity))
         moment = 0.01  # s; long enough for single precision
         now, then = leg.forward(self.geometry, q), leg.forward(self.geometry, q + moment * speed)
-        share = load_share(path.leg_phases(state.phase), state.gate)
+        share = load_share(self.phases(state.phase), state.gate)
         x, y, z = share @ (self.geometry.hip_position + now)
         a, b, c = sensors.angular_velocity
         turned = stack([b * z - c * y, c * x - a * z, a * y - b * x])
@@ -212,7 +220,7 @@ class Core:
     def residual_displacement(self, state: ControllerState, sensors: Sensors) -> Array:
         """How far residual joint angles lead the feet (4, 3) m from the trajectory generator's, heading frame."""
         xp = state.targets.__array_namespace__()
-        phases = path.leg_phases(state.phase)
+        phases = self.phases(state.phase)
         target = self.foot_targets(phases, state.lift * state.gate, state.stride, sensors, gate=state.gate)
         level = frames.heading_from_trunk(frames.up_in_trunk(sensors.orientation))
         return (xp.reshape(state.targets[0], (4, 3)) - target) @ level.T
@@ -245,8 +253,9 @@ class Core:
 
     def _time_left(self, state: ControllerState, xp: Any) -> Array:
         """Time (4,) s until feet in swing come down."""
-        phases = path.leg_phases(state.phase)
-        return xp.maximum(math.pi - phases, 0.0 * phases) / (2.0 * math.pi * state.frequency)
+        phases = self.phases(state.phase)
+        share = self.config.swing_share / math.pi
+        return share * xp.maximum(math.pi - phases, 0.0 * phases) / state.frequency
 
     def observe(
         self, state: ControllerState, sensors: Sensors, heights: Array | None, command: Array
@@ -311,9 +320,14 @@ class Core:
         if c.finish_step:
             # Feet in swing come down where they were to, and all feet stay where they are then.
             swinging = self._unfinished(state)
-            down = xp.where(state.phase > 0, -math.pi + 0.0 * phase, 0.0 * phase)
-            landed = xp.where(phase * state.phase > 0, phase, down)
-            finishing = xp.where(swinging, landed, state.phase)
+            legs = self.phases(state.phase)
+            leg_up = xp.argmax(legs)
+            lift_off, down = xp.asarray(self._swings)[:, leg_up]
+            landed = xp.where(path.wrap(phase - down) < 0, phase, down)
+            # Feet that lift off or come down at this very moment are put down by rounding, if by nothing else.
+            nearest = xp.where(legs[leg_up] > 0.5 * math.pi, down, lift_off)
+            settled = xp.where((state.gate > 0) & (legs[leg_up] > 0), nearest, state.phase)
+            finishing = xp.where(swinging, landed, settled)
             # From a step's end on the stride is there at once: so it's the phase that gathers speed. From the middle of
             # a step on, as after a reset, the stride is never ahead of the gate.
             rate = 1.0 - xp.maximum(xp.max(xp.abs(stride)) - gate, 0.0 * gate)
@@ -323,7 +337,7 @@ class Core:
             stride = xp.where(moving > 0, stride, state.stride)
         else:
             phase = xp.where(moving > 0, phase, state.phase)
-        phases = path.leg_phases(phase)
+        phases = self.phases(phase)
         lift = xp.where(phases > 0, state.lift, self._lift(action[1]))
 
         up = frames.up_in_trunk(sensors.orientation)
@@ -363,11 +377,10 @@ class Core:
         told = xp.sum(command * command) > 0.25
         return told | self._unfinished(state) if self.config.finish_step else told
 
-    @staticmethod
-    def _unfinished(state: ControllerState) -> Array:
+    def _unfinished(self, state: ControllerState) -> Array:
         """Whether feet are off the ground, () bool."""
         xp = state.phase.__array_namespace__()
-        return (state.gate > 0) & (xp.abs(xp.sin(state.phase)) > _DOWN)
+        return (state.gate > 0) & (xp.max(xp.sin(self.phases(state.phase))) > _DOWN)
 
     def foot_targets(
         self,
@@ -393,7 +406,7 @@ class Core:
         """
         xp = phases.__array_namespace__()
         c = self.config
-        along = path.stride(phases, c.retraction)[:, None] * (c.step_length * stride)
+        along = path.stride(phases, c.retraction, c.swing_share)[:, None] * (c.step_length * stride)
         up = lift * path.height(phases)
         if level is None:
             level = frames.heading_from_trunk(frames.up_in_trunk(sensors.orientation))
@@ -442,6 +455,17 @@ class Core:
     @functools.cached_property
     def _ring_offsets(self) -> Array:
         return self._constant(samples.ring_offsets(self.config.sample_radius))
+
+    @functools.cached_property
+    def _swings(self) -> Array:
+        """(2, 4) rad, the gait's phase when each leg lifts off and when it comes down."""
+        c, turn = self.config, 2.0 * math.pi
+        # A little before and after, but for a trot that has no moment with all feet down: so rounding leaves none up.
+        late = 1e-4 if c.swing_share < 0.5 else 0.0
+        ends = [
+            [end - offset for offset in path.GAITS[c.gait]] for end in (-late, turn * c.swing_share + late)
+        ]
+        return self._constant([[(x + math.pi) % turn - math.pi for x in row] for row in ends])
 
     @functools.cached_property
     def _action_mirror(self) -> tuple[Array, Array]:

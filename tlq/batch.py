@@ -147,7 +147,7 @@ def _moment(env: envs.QuadrupedEnv, episode: envs.Episode) -> judge.Moment:
     return judge.Moment(
         position=episode.qpos[:2],
         yaw=yaw,
-        phases=tg.path.leg_phases(episode.controller.phase),
+        phases=env.core.phases(episode.controller.phase),
         feet=feet[:, 2] + episode.qpos[2],
         ground=terrains.height(env.bank, episode.terrain, points),
         work=power * env.dt,

@@ -75,7 +75,7 @@ def walk(policy: str, terrain: terrains.Terrain, distance: float = judge.GOAL) -
         moment = sim.step(np.array([1.0, 0.0]))
         rows["feet"].append(sim.data.site_xpos[sites].copy())
         rows["lift"].append(np.array(controller.state.lift))
-        rows["swing"].append(tg.path.leg_phases(controller.state.phase) > 0)
+        rows["swing"].append(controller.core.phases(controller.state.phase) > 0)
         rows["desired"].append(np.array(controller.state.desired))
         reached, work = max(reached, float(moment.position[0])), work + float(moment.work)
         fell = bool(moment.fell)

@@ -267,8 +267,13 @@ def _core(metadata: dict[str, Any]) -> tg.Core:
         numbers(metadata["torque_limit"], "torque_limit", 12)
         for name in ("control_dt", "kp", "kd", "sag"):
             numbers(metadata[name], name)
+        if settings.gait not in tg.path.GAITS:
+            raise PolicyFileError(f"metadata: tg.gait must be one of {', '.join(tg.path.GAITS)}")
         for name, value in metadata["tg"].items():
-            numbers(value, f"tg.{name}")
+            if name != "gait":
+                numbers(value, f"tg.{name}")
+        if not 0.0 < settings.swing_share <= tg.path.LONGEST_SWING[settings.gait]:
+            raise PolicyFileError("metadata: tg.swing_share is out of range")
         if len(metadata["joint_names"]) != 12 or not all(isinstance(n, str) for n in metadata["joint_names"]):
             raise PolicyFileError("metadata: joint_names must be 12 names")
         size = metadata["memory"]["size"]

@@ -94,7 +94,7 @@ class Simulation:
         return Moment(
             position=self.data.qpos[:2].copy(),
             yaw=np.asarray(self.yaw),
-            phases=tg.path.leg_phases(self.controller.state.phase),
+            phases=self.controller.core.phases(self.controller.state.phase),
             feet=self._feet[:, 2] + self.data.qpos[2],
             ground=self._ground,
             work=np.asarray(work),

@@ -126,7 +126,7 @@ class Supervisor:
         if self.last is None or not core.config.look_ahead:
             return np.full((4, 2), np.nan)
         sensors = tg.Sensors(**self.last.sensors)
-        swing = (tg.path.leg_phases(state.phase) > 0)[:, None]
+        swing = (core.phases(state.phase) > 0)[:, None]
         # The state is a step ahead of the sensors: that is when the next ones will be read.
         return np.where(swing, core.centres(state, sensors), np.nan)
 

@@ -111,6 +111,33 @@ def test_told_to_stand_it_finishes_its_step_and_stays(subject, steps):
         before = state
 
 
+@pytest.mark.parametrize(("gait", "share"), [("trot", 0.4), ("walk", 0.24), ("walk", 0.15)])
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_other_gaits_finish_their_step_with_all_feet_down(subject, gait, share, dtype):
+    core = subject.make(dtype, gait=gait, swing_share=share)
+    still, cycle = np.zeros(14, dtype), round(1.0 / core.config.base_frequency / core.dt)
+    for steps in range(30, 30 + cycle):
+        walking = walk(core, steps, action=still)[-1][0]
+        standing = [state for state, _ in walk(core, 60, command=STAND, state=walking, action=still)]
+        moving = [core.stepping(state, STAND) for state in standing]
+        assert moving == sorted(moving, reverse=True) and not moving[-1]
+        assert sum(moving) * core.dt < share / core.config.base_frequency + 1e-6
+        assert standing[-1].gate == 0.0 and not (core.phases(standing[-1].phase) > 0).any()
+        # One that has all feet down stays where it is at once.
+        if not (core.phases(walking.phase) > 0).any():
+            assert standing[-1].phase == walking.phase
+
+
+def test_speed_of_feet_in_stance(subject):
+    """The desired feet's, of a robot led ahead, against the difference of two targets."""
+    core = subject.make(np.float64, gait="walk", swing_share=0.2)
+    before, after = (state for state, _ in walk(core, 60, command=np.array([1.0, 0.0]), action=np.zeros(14))[-2:])
+    stance = (core.phases(before.phase) < 0) & (core.phases(after.phase) < 0)
+    feet = (after.targets[0] - after.targets[1]).reshape(4, 3)[stance] / core.dt
+    assert stance.sum() >= 3
+    np.testing.assert_allclose(feet[:, 0], -core.stance_speed(after.frequency), rtol=1e-6)
+
+
 def test_one_told_to_stand_before_it_has_moved_stays(subject):
     core = subject.core
     start = core.initial_state(np.asarray(0.5 * np.pi))

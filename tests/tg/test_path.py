@@ -118,6 +118,46 @@ def test_retraction_gives_feet_the_grounds_speed():
     np.testing.assert_allclose(path.stride(phases, 0.5), half, atol=1e-12)
 
 
+GAITS = [("trot", 0.5), ("trot", 0.4), ("walk", 0.24), ("walk", 0.2)]
+
+
+@pytest.mark.parametrize(("gait", "share"), GAITS)
+def test_each_leg_swings_for_its_share_of_the_cycle(gait, share):
+    """Counted over an even grid of the cycle: who is up, for how long, in which order."""
+    cycle = np.linspace(-PI, PI, 100_000, endpoint=False)
+    phases = path.leg_phases(cycle, share, gait)
+    swing = phases > 0
+    np.testing.assert_allclose(swing.mean(axis=0), share, atol=1e-4)
+    most = {"trot": 2, "walk": 1}[gait]
+    assert set(swing.sum(axis=1)) <= {0, 1, most}  # 1: the grid's ends
+    lift_off = [cycle[np.flatnonzero(swing[:, leg] & ~np.roll(swing[:, leg], 1))[0]] for leg in range(4)]
+    after = path.wrap(np.array(lift_off) - lift_off[0]) / PI  # LF, RF, LR, RR
+    if gait == "trot":
+        np.testing.assert_allclose(np.abs(after), [0, 1, 1, 0], atol=1e-4)
+    else:  # LR, LF, RR, RF: each hind foot a quarter cycle before the fore foot of its side
+        np.testing.assert_allclose(after[2], -0.5, atol=1e-4)
+        np.testing.assert_allclose(after[3], 0.5, atol=1e-4)
+        assert abs(after[1]) == pytest.approx(1.0, abs=1e-4)
+    # Both halves run evenly, from 0 to π and from -π to 0.
+    rate = path.wrap(np.diff(phases, axis=0)) / np.diff(cycle)[:, None]
+    assert rate.min() == pytest.approx(0.5 / (1 - share)) and rate.max() == pytest.approx(0.5 / share)
+
+
+@pytest.mark.parametrize(("gait", "share"), GAITS)
+def test_feet_come_down_with_the_grounds_speed_whatever_their_share_of_swing(gait, share):
+    """f L / (1 - s) in stance, and the same in the first and last moment of swing."""
+    frequency, length, small = 1.6, 0.2, 1e-6
+    time = np.linspace(0.0, 1.0 / frequency, 8001)
+    leg = path.leg_phases(path.wrap(2 * PI * frequency * time), share, gait)[:, 1]
+    speed = np.diff(length * path.stride(leg, 1.0, share)) / np.diff(time)
+    stance = (leg[1:] < 0) & (leg[:-1] < 0) & (np.diff(leg) > 0)
+    np.testing.assert_allclose(speed[stance], -frequency * length / (1 - share), rtol=1e-6)
+    for phase in (0.0, PI - small):
+        slope = (path.stride(np.array(phase + small), 1.0, share) - path.stride(np.array(phase), 1.0, share)) / small
+        swing = share / frequency  # s, in which the phase goes by π
+        assert length * slope * PI / swing == pytest.approx(-frequency * length / (1 - share), rel=1e-3)
+
+
 @pytest.mark.parametrize(("third", "outer"), [(0.06, 0.10), (0.12, 0.24)])
 def test_samples_lie_on_the_circles(third, outer):
     points = np.array(tg.samples.ring_offsets(outer))
