@@ -68,8 +68,8 @@ class CurriculumConfig:
     down: float = 0.35
     """A level down below this share."""
     leap: int = 1
-    """How many levels up at once. Only one episode in three counts, and one that succeeds is the longest: with thousands
-    of environments a ladder climbed rung by rung takes most of a run."""
+    """How many levels up at once. Only one episode in three counts, and one that succeeds is the longest: with
+    thousands of environments a ladder climbed rung by rung takes most of a run."""
     practice: float = 0.5
     """Share of the episodes that practise footholds: on terrain of any difficulty whose pits are `practice_depth` deep.
     A misstep there costs the foot-terrain reward but no fall, so there is much to learn from each episode. They don't

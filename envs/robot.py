@@ -50,7 +50,7 @@ class RobotConfig:
     """Dry friction of each joint, N m. The published model has 0.5; costs about 9 % of the speed."""
     foot_friction: float = 0.8
     """Sliding friction between foot and terrain, whatever the terrain's own."""
-    foot_height: float = -0.28
+    foot_height: float = -0.33
     """Height of a resting foot under its hip joint, m: the base position is (0, side * offset, foot_height)
     from the abduction joint."""
     file: ModelFile = dataclasses.field(default_factory=ModelFile)

@@ -31,8 +31,8 @@ class TGConfig:
     """trot (the paper's: diagonal legs together) or walk (one after the other, three feet down; with a `swing_share` of
     at most 0.24)."""
     swing_share: float = 0.5
-    """Share of the gait cycle that a leg is in swing. The paper's is 0.5; below it all feet are down for a while between
-    the two pairs' swings, and the trunk can be brought back to level."""
+    """Share of the gait cycle that a leg is in swing. The paper's is 0.5; below it all feet are down for a while
+    between the two pairs' swings, and the trunk can be brought back to level."""
     step_length: float = 0.16
     """L, the stride from lift-off to touch-down (m). 0 leaves only the vertical motion (the fixed-height baseline)."""
     retraction: float = 1.0
@@ -40,12 +40,12 @@ class TGConfig:
     in the paper."""
     lift: float = 0.08
     """H, the predefined foot height (m)."""
-    lift_range: float = 0.06
+    lift_range: float = 0.1
     """δh at action ±1 (m). 0 fixes the foot height."""
     lift_min: float = 0.02
     """Lower bound of H + δh (m)."""
-    lift_max: float = 0.14
-    """Upper bound of H + δh (m): higher than this the knee limit is reached."""
+    lift_max: float = 0.18
+    """Upper bound of H + δh (m): higher than this the knee limit is reached, for a robot that stands 0.33 m high."""
     residual_range: float = 0.4
     """Residual joint angle at action ±1 (rad): a foot can be moved by 11 cm, half the distance between thin poles."""
     levelling: float = 1.0

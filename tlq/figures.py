@@ -16,7 +16,6 @@ import numpy as np
 
 import envs
 import terrains
-import tg
 from tlq import cli, judge
 from tlq.cli import find_policy, option
 from tlq.config import training_env

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from mujoco import mjx
 
+import tg
 from envs import EnvConfig, RobotConfig, physics
 from envs.dynamics import TreeDynamics, not_covered
 from envs.env import check
@@ -172,3 +173,12 @@ def test_what_isnt_covered_is_named():
 def test_unknown_dynamics():
     with pytest.raises(ValueError, match="unknown dynamics 'three'; choose one of tree, mjx"):
         check(EnvConfig(dynamics="three"))
+
+
+def test_gaits_that_cannot_be():
+    for gait, share, message in [
+        ("pace", 0.5, "unknown gait 'pace'; choose one of trot, walk"),
+        ("walk", 0.5, "tg.swing_share=0.5 must be at most 0.24 with tg.gait=walk"),
+    ]:
+        with pytest.raises(ValueError, match=message):
+            check(EnvConfig(tg=tg.TGConfig(gait=gait, swing_share=share)))

@@ -405,6 +405,12 @@ def test_ladder(exact):
         exact, dataclasses.replace(exact.config, curriculum=envs.CurriculumConfig(enabled=False))
     )
     assert after(5.0, env=fixed) == 4
+    fast = with_config(exact, dataclasses.replace(exact.config, curriculum=envs.CurriculumConfig(leap=3)))
+    assert (
+        after(2.46, env=fast) == 7
+        and after(1.22, env=fast) == 3
+        and after(5.0, level=top - 1, env=fast) == top
+    )
 
 
 def test_auto_reset_climbs_and_descends(noisy):

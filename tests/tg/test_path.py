@@ -153,7 +153,9 @@ def test_feet_come_down_with_the_grounds_speed_whatever_their_share_of_swing(gai
     stance = (leg[1:] < 0) & (leg[:-1] < 0) & (np.diff(leg) > 0)
     np.testing.assert_allclose(speed[stance], -frequency * length / (1 - share), rtol=1e-6)
     for phase in (0.0, PI - small):
-        slope = (path.stride(np.array(phase + small), 1.0, share) - path.stride(np.array(phase), 1.0, share)) / small
+        slope = (
+            path.stride(np.array(phase + small), 1.0, share) - path.stride(np.array(phase), 1.0, share)
+        ) / small
         swing = share / frequency  # s, in which the phase goes by π
         assert length * slope * PI / swing == pytest.approx(-frequency * length / (1 - share), rel=1e-3)
 

@@ -247,6 +247,8 @@ def graph(number, **changes):
         ({"metadata": metadata(default_pose=[0.0] * 11)}, r"default_pose must be \(12,\) finite numbers"),
         ({"metadata": metadata(kp=float("nan"))}, r"kp must be \(\) finite numbers"),
         ({"metadata": metadata(tg__lift="high")}, "metadata: something is missing or wrong"),
+        ({"metadata": metadata(tg__gait="pace")}, "metadata: tg.gait must be one of trot, walk"),
+        ({"metadata": metadata(tg__swing_share=0.6)}, "metadata: tg.swing_share is out of range"),
         ({"metadata": metadata(tg__wings=2)}, "metadata: something is missing or wrong .*wings"),
         ({"metadata": metadata(memory__size=3)}, "its graph doesn't fit its arrays"),
         ({"metadata": metadata(memory__size=-1)}, "memory.size"),

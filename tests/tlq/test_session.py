@@ -15,7 +15,12 @@ from tlq.senses import PerceptionConfig
 from tlq.session import Session
 
 # A gait that stays up for a second or two without a policy.
-GAIT = {"env.tg.base_frequency": 1.6, "env.tg.step_length": 0.2, "env.tg.retraction": 0.0}
+GAIT = {
+    "env.tg.base_frequency": 1.6,
+    "env.tg.step_length": 0.2,
+    "env.tg.retraction": 0.0,
+    "env.robot.foot_height": -0.28,
+}
 SMALL = {"policy.encoder": 8, "policy.head": 8, "policy.memory_width": 4, **GAIT}
 
 
