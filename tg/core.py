@@ -36,6 +36,8 @@ HANDED_BACK = 0.3
 
 _DOWN = 1e-3
 """Sine of the phase below which all feet are down."""
+_LATE = 1e-4
+"""Phase (rad) before lift-off and after touch-down at which a gait rests, so that rounding leaves no foot up."""
 
 MIRRORED_LEG = (1, 0, 3, 2)
 """The leg that each leg is in the mirror."""
@@ -460,8 +462,8 @@ class Core:
     def _swings(self) -> Array:
         """(2, 4) rad, the gait's phase when each leg lifts off and when it comes down."""
         c, turn = self.config, 2.0 * math.pi
-        # A little before and after, but for a trot that has no moment with all feet down: so rounding leaves none up.
-        late = 1e-4 if c.swing_share < 0.5 else 0.0
+        # A trot with half of the cycle in swing has no moment with all feet down.
+        late = _LATE if c.swing_share < path.LONGEST_SWING["trot"] else 0.0
         ends = [
             [end - offset for offset in path.GAITS[c.gait]] for end in (-late, turn * c.swing_share + late)
         ]
