@@ -343,8 +343,8 @@ def test_landings_are_where_feet_come_down(exact):
 
     places = jax.jit(places)
     last, since, landings = [None] * 4, [None] * 4, 0
-    for number in range(80):
-        action = 0.3 * jnp.sin(0.3 * number + jnp.arange(14))
+    for number in range(160):
+        action = 0.2 * jnp.sin(0.3 * number + jnp.arange(14))
         state = step(state, action)
         (led, feet), swing, yaw = jax.tree.map(np.asarray, places(state.pipeline_state))
         found = state.info["landings"]
@@ -362,4 +362,4 @@ def test_landings_are_where_feet_come_down(exact):
                 landings += 1
                 missed = tg.frames.turn(-yaw, feet[leg] - last[leg])
                 np.testing.assert_allclose(found.missed[leg], missed, atol=1e-5)
-    assert landings > 6
+    assert landings > 12
