@@ -7,6 +7,7 @@ would have saved a footstep; this tells it, by its slope (`ppo.guide` is the wei
 was tried: which one is best is ambiguous, and the mean of two poles is a gap (docs/experiments.md).
 """
 
+import functools
 from typing import Any, NamedTuple, cast
 
 import jax
@@ -33,6 +34,9 @@ FARTHER, ANOTHER = 1.0, 2.0
 that is nothing but gap costs 1."""
 GAP = 3.0
 """What it costs to lead a foot to nothing but gap. Robots have balance to spare, but not one footstep."""
+LACKING = 10.0
+"""What a metre to the nearest place with less gap than ground adds to a share of gap: in the middle of a wide gap the
+share is 1 all round and says nothing of where the ground is."""
 BALANCE = 0.15
 """Seconds of the trunk's excess speed that a foot is placed farther along, as a walking inverted pendulum asks for."""
 ACROSS = 6.0
@@ -93,6 +97,23 @@ def gap_shares(env: QuadrupedEnv, episode: Episode, ends: jax.Array) -> jax.Arra
     return sum(w * rows[:, :, i : i + SIDE] for i, w in enumerate(weights))
 
 
+def lacking(gaps: jax.Array) -> jax.Array:
+    """(N, SIDE, SIDE) m, from each of `places` to the nearest with a share of gap (N, SIDE, SIDE) below one half; no
+    more than a cell beyond REACH.
+    """
+    far = (REACH + 1) ** 2
+    squares = jnp.where(gaps < 0.5, 0.0, jnp.float32(far))
+    for axis in (1, 2):  # the square of a distance is one along x and one along y
+        beside = [(0, 0), *((REACH, REACH) if a == axis else (0, 0) for a in (1, 2))]
+        padded = jnp.pad(squares, beside, constant_values=far)
+        moved = [
+            jax.lax.slice_in_dim(padded, REACH + i, REACH + i + SIDE, axis=axis) + i * i
+            for i in range(-REACH, REACH + 1)
+        ]
+        squares = functools.reduce(jnp.minimum, moved)
+    return CELL * jnp.sqrt(jnp.minimum(squares, far))
+
+
 class Steps(NamedTuple):
     """The two feet farthest into their swing, and the ground where they may land. Heading frame."""
 
@@ -105,7 +126,8 @@ class Steps(NamedTuple):
     now: jax.Array
     """(2, 2) m, where they are led already, from `ends`, made up for what `share` holds back."""
     gaps: jax.Array
-    """(2, SIDE, SIDE) share of gap that a foot meets that lands near one of `places`."""
+    """(2, SIDE, SIDE) share of gap that a foot meets that lands near one of `places`, and LACKING times what it lacks
+    to ground."""
     ahead: jax.Array
     """(2,) m, the displacement that balance asks for."""
     asked: jax.Array
@@ -119,6 +141,7 @@ def steps(env: QuadrupedEnv, episode: Episode) -> Steps:
     _, legs = jax.lax.top_k(phases, 2)  # no gait has more in swing
     ends = env.step_ends(episode)[legs]
     gaps = gap_shares(env, episode, ends)
+    gaps += LACKING * lacking(gaps)
     share = tg.path.smoothstep(jnp.clip((phases[legs] - LIFTING) / (ARRIVED - LIFTING), 0.0, 1.0))
     now = env.core.residual_displacement(controller, sensors)[legs, :2] / jnp.maximum(share, FIRST)[:, None]
     now = jnp.clip(now, -REACH * CELL, REACH * CELL)
@@ -131,7 +154,7 @@ def steps(env: QuadrupedEnv, episode: Episode) -> Steps:
 
 
 def between(gaps: jax.Array, displacement: jax.Array) -> jax.Array:
-    """Bilinear share (...) of gap at displacements (..., 2) m, of a map (..., SIDE, SIDE); at its rim beyond it."""
+    """Bilinear value (...) at displacements (..., 2) m, of a map (..., SIDE, SIDE); at its rim beyond it."""
     at = jnp.clip(
         displacement / CELL + REACH, 0.0, SIDE - 1.001
     )  # short of the last cell, which has no next one
@@ -219,7 +242,7 @@ class Guidance(NamedTuple):
     legs: jax.Array
     """(2,) int32, the feet in swing that the rest is about, but for the last two."""
     gaps: jax.Array
-    """(2, SIDE, SIDE) float16, share of gap at each place."""
+    """(2, SIDE, SIDE) float16, of `Steps`."""
     ahead: jax.Array
     """(2,) m, the displacement that balance asks for."""
     across: jax.Array

@@ -55,6 +55,21 @@ def gap_shares(height, rewards):
     return np.array(shares)
 
 
+def lacking(gaps):
+    """How far (m) each of the guide's places is from the nearest that has less gap than ground."""
+    rim = guide.CELL * (guide.REACH + 1)
+    firm = guide.places()[gaps < 0.5]
+    return np.array([min([rim, *np.linalg.norm(firm - place, axis=1)]) for place in guide.places()])
+
+
+@pytest.mark.parametrize("share", [0.0, 0.01, 0.2, 0.5, 1.0])
+def test_what_a_place_lacks_to_ground(share):
+    gaps = np.random.default_rng(0).random((3, guide.SIDE, guide.SIDE)) < 1 - share
+    found = jax.jit(guide.lacking)(gaps.astype(np.float32))
+    for table, distances in zip(gaps, found, strict=True):
+        np.testing.assert_allclose(np.ravel(distances), lacking(np.ravel(table)), atol=1e-6)
+
+
 @pytest.mark.parametrize("command", [LEFT, RIGHT])
 def test_feet_are_led_to_the_best_ground_near(exact, command):
     env, k, random = exact.env, exact.find("poles", 9), np.random.default_rng(0)
@@ -80,6 +95,7 @@ def test_feet_are_led_to_the_best_ground_near(exact, command):
             reach = guide.REACH * guide.CELL
             now = np.clip(np.asarray(residual)[leg, :2] / max(shares[-1], 0.3), -reach, reach)
             gaps = gap_shares(lambda way, end=end, xy=xy: ground(terrain, env, xy, end + way), c.rewards)
+            gaps += guide.LACKING * lacking(gaps)
             away = np.linalg.norm(now - guide.places(), axis=1)
             far = np.linalg.norm(balance - guide.places(), axis=1)
             costs.append(gaps + guide.FARTHER * far + guide.ANOTHER * away)
