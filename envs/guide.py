@@ -32,9 +32,12 @@ NEAR = 2
 FARTHER, ANOTHER = 1.0, 2.0
 """What a metre costs from where balance wants the foot, and one from where it is led already; to the reflex a place
 that is nothing but gap costs 1."""
+FAR = 0.17
+"""So far (m) from where balance wants the foot costs 1, and goes with the square: wide steps aside upset the trunk, and
+feet come down beside their places."""
 GAP = 3.0
 """What it costs to lead a foot to nothing but gap. Robots have balance to spare, but not one footstep."""
-LACKING = 10.0
+LACKING = 20.0
 """What a metre to the nearest place with less gap than ground adds to a share of gap: in the middle of a wide gap the
 share is 1 all round and says nothing of where the ground is."""
 BALANCE = 0.15
@@ -179,7 +182,7 @@ def displacements(env: QuadrupedEnv, episode: Episode) -> tuple[jax.Array, jax.A
     s = steps(env, episode)
     away = jnp.linalg.norm(s.now[:, None] - places(), axis=-1)
     far = jnp.linalg.norm(s.ahead - places(), axis=-1)
-    cost = s.gaps.reshape(2, -1) + FARTHER * far + ANOTHER * away
+    cost = s.gaps.reshape(2, -1) + jnp.square(far / FAR) + FARTHER * far + ANOTHER * away
     together = jnp.all(env.core.phases(episode.controller.phase)[s.legs] > 0)
     best = _best_pair(cost, s.ahead, s.ends[0] - s.ends[1], jnp.where(together, ACROSS, 0.0))
     led = jnp.zeros((4, 2)).at[s.legs].set(s.share[:, None] * best)
@@ -383,7 +386,7 @@ def cost(guidance: Guidance, action: jax.Array) -> jax.Array:
     far = jnp.sqrt(jnp.sum(jnp.square(off), axis=-1) + 1e-6)  # a slope at 0, too
     moved = jnp.sum(jnp.square((led - guidance.last) / STEADY), axis=-1)
     gap = between(guidance.gaps.astype(jnp.float32), led + guidance.error)
-    each = GAP * gap + FARTHER * far + BEYOND * beyond + moved
+    each = GAP * gap + jnp.square(far / FAR) + FARTHER * far + BEYOND * beyond + moved
     middle = jnp.abs(jnp.sum(jnp.mean(off, axis=-2) * guidance.across, axis=-1))
     weight = guidance.weight * guidance.known
     both = jnp.min(weight, axis=-1)

@@ -98,7 +98,7 @@ def test_feet_are_led_to_the_best_ground_near(exact, command):
             gaps += guide.LACKING * lacking(gaps)
             away = np.linalg.norm(now - guide.places(), axis=1)
             far = np.linalg.norm(balance - guide.places(), axis=1)
-            costs.append(gaps + guide.FARTHER * far + guide.ANOTHER * away)
+            costs.append(gaps + (far / guide.FAR) ** 2 + guide.FARTHER * far + guide.ANOTHER * away)
             axis = np.arange(-guide.REACH, guide.REACH + 1) * guide.CELL
             table = gaps.reshape(guide.SIDE, guide.SIDE)
             here = interpolate.RegularGridInterpolator((axis, axis), table)(now)[0]
@@ -209,7 +209,8 @@ def slow_cost(guidance, action):
         landed = np.clip(led + error, axis[0], axis[-1])
         gap = interpolate.RegularGridInterpolator((axis, axis), gaps.astype(float))(landed)[0]
         away = np.linalg.norm(led - guidance.ahead)
-        total += weight * (guide.GAP * gap + guide.FARTHER * away + guide.BEYOND * np.abs(led - inside).sum())
+        total += weight * (guide.GAP * gap + (away / guide.FAR) ** 2)
+        total += weight * (guide.FARTHER * away + guide.BEYOND * np.abs(led - inside).sum())
         total += weight * sum((led - last) ** 2) / guide.STEADY**2
         middle += (led - guidance.ahead) / 2
     return total + weights.min() * guide.ACROSS * abs(middle @ guidance.across)
