@@ -106,15 +106,15 @@ def lacking(gaps: jax.Array) -> jax.Array:
     """
     far = (REACH + 1) ** 2
     squares = jnp.where(gaps < 0.5, 0.0, jnp.float32(far))
-    for axis in (1, 2):  # the square of a distance is one along x and one along y
-        beside = [(0, 0), *((REACH, REACH) if a == axis else (0, 0) for a in (1, 2))]
+    # The square of a distance is one along x and one along y. On a CPU shifts take a quarter of a table's time.
+    for axis in (1, 2):
+        beside = [(REACH, REACH) if a == axis else (0, 0) for a in range(3)]
         padded = jnp.pad(squares, beside, constant_values=far)
-        moved = [
-            jax.lax.slice_in_dim(padded, REACH + i, REACH + i + SIDE, axis=axis) + i * i
-            for i in range(-REACH, REACH + 1)
+        shifted = [
+            jax.lax.slice_in_dim(padded, i, i + SIDE, axis=axis) + (i - REACH) ** 2 for i in range(SIDE)
         ]
-        squares = functools.reduce(jnp.minimum, moved)
-    return CELL * jnp.sqrt(jnp.minimum(squares, far))
+        squares = functools.reduce(jnp.minimum, shifted)
+    return CELL * jnp.sqrt(squares)
 
 
 class Steps(NamedTuple):
@@ -245,7 +245,7 @@ class Guidance(NamedTuple):
     legs: jax.Array
     """(2,) int32, the feet in swing that the rest is about, but for the last two."""
     gaps: jax.Array
-    """(2, SIDE, SIDE) float16, of `Steps`."""
+    """(2, SIDE, SIDE) float16, as in `Steps`."""
     ahead: jax.Array
     """(2,) m, the displacement that balance asks for."""
     across: jax.Array
