@@ -35,7 +35,7 @@ class Options:
     """What a user may set."""
 
     figure: str = option("stairs", "which", choices=lambda: ("stairs", "gaps"))
-    ours: str = option("mixed", "policy of the paper's method")
+    ours: str = option("", "policy of the paper's method; if none is given, mixed, for gaps stones")
     fixed_height: str = option("", "policy of that baseline")
     blind: str = option("", "policy of that baseline")
     picture: str = option("", "PNG file to write", required=True)
@@ -135,7 +135,9 @@ def gaps(options: Options) -> tuple[Any, dict[str, Any]]:
     """Figure and numbers: desired angles of the front legs, and the hip's amplitude while a foot crosses each gap."""
     from matplotlib import pyplot as plt
 
-    figure, axes = plt.subplots(len(COURSES), 2, figsize=(13, 6), sharex="row", constrained_layout=True)
+    figure, axes = plt.subplots(
+        len(COURSES), 3, figsize=(14, 6), width_ratios=(2, 2, 1), constrained_layout=True
+    )
     numbers: dict[str, Any] = {}
     for row, course in zip(axes, COURSES, strict=True):
         sizes = dataclasses.replace(terrains.GapsConfig(), widths=course)
@@ -144,7 +146,7 @@ def gaps(options: Options) -> tuple[Any, dict[str, Any]]:
         edges = gap_edges(terrain)
         trace = walk(options.ours, terrain, min(judge.GOAL, edges[-1][1] + 0.8))
         time = 0.02 * np.arange(len(trace.desired))
-        for leg, axis in enumerate(row):
+        for leg, axis in enumerate(row[:2]):
             for joint, name in enumerate(("abduction", "hip", "knee")):
                 axis.plot(time, trace.desired[:, 3 * leg + joint], lw=0.9, label=name)
             for start, end in edges:
@@ -155,14 +157,19 @@ def gaps(options: Options) -> tuple[Any, dict[str, Any]]:
                 f"{('left', 'right')[leg]} front leg, gaps {[round(100 * g, 1) for g in course]} cm"
             )
             axis.set_ylabel("desired angle (rad)")
+        amplitudes = [amplitude(trace, start, end) for start, end in edges]
+        crossed = [(100 * w, a) for w, a in zip(course, amplitudes, strict=True) if a is not None]
+        row[2].plot(*zip(*sorted(crossed), strict=True) if crossed else ([], []), "C1.-")
+        row[2].set_ylabel("hip's amplitude (rad)")
+        row[2].set_ylim(bottom=0.0)
         numbers[str(list(course))] = {
             "distance_m": trace.distance,
             "fell": trace.fell,
-            "hip_amplitude_rad": [amplitude(trace, start, end) for start, end in edges],
+            "hip_amplitude_rad": amplitudes,
         }
-    axes[0, 0].legend(fontsize=8)
-    for axis in axes[-1]:
-        axis.set_xlabel("time (s)")
+    axes[0, 0].legend(fontsize=8, ncols=3, loc="center left")
+    for axis, label in zip(axes[-1], ("time (s)", "time (s)", "gap's width (cm)"), strict=True):
+        axis.set_xlabel(label)
     return figure, numbers
 
 
@@ -192,7 +199,9 @@ def main(arguments: Sequence[str]) -> None:
     options = cli.parse(Options, arguments, __doc__ or "")
     cli.check_folders(options, "picture", "json")
     if not chosen(options):
-        raise ValueError(f"no policy is given; set one of {', '.join(envs.METHODS)}")
+        options = dataclasses.replace(options, ours={"stairs": "mixed", "gaps": "stones"}[options.figure])
+    if options.figure == "gaps" and not options.ours:
+        raise ValueError("the figure of gaps is of the paper's method: set ours=")
     if options.seed < 0:
         raise ValueError(f"seed={options.seed} must be 0 or more")
     import matplotlib

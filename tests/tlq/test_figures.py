@@ -45,12 +45,23 @@ def test_both_figures_are_written(tmp_path, capsys):
     assert "lift_median_m" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_the_policy_for_stones_crosses_the_papers_gaps(tmp_path, seed):
+    """In MuJoCo C, gaps of up to 25.5 cm; the hips swing wider over the widest gap than over the narrowest."""
+    picture, numbers = tmp_path / "gaps.png", tmp_path / "gaps.json"
+    figures.main(["figure=gaps", f"seed={seed}", f"picture={picture}", f"json={numbers}"])
+    for name, course in json.loads(numbers.read_text()).items():
+        assert not course["fell"] and course["distance_m"] > 2.1, name
+        widths, amplitudes = json.loads(name), course["hip_amplitude_rad"]
+        assert amplitudes[widths.index(max(widths))] > amplitudes[widths.index(min(widths))]
+
+
 def test_wrong_settings_name_what_is_right(tmp_path):
     with pytest.raises(ValueError, match="unknown figure 'stair'"):
         figures.main(["figure=stair", "picture=x.png"])
     with pytest.raises(ValueError, match="picture= is missing"):
         figures.main([])
-    with pytest.raises(ValueError, match="no policy is given; set one of ours, fixed_height, blind"):
-        figures.main(["ours=", "picture=x.png"])
+    with pytest.raises(ValueError, match="the figure of gaps is of the paper's method: set ours="):
+        figures.main(["figure=gaps", "blind=mixed_blind", "picture=x.png"])
     with pytest.raises(ValueError, match="policy=nobody: no such policy"):
         figures.main(["ours=nobody", f"picture={tmp_path / 'x.png'}"])
