@@ -376,7 +376,7 @@ class QuadrupedEnv(Env):
         gaps = jnp.stack(
             [
                 *(jnp.mean(low[:, r], axis=1) for r in tg.samples.circles()),
-                self._aim(episode, true + episode.qpos[2]),
+                self._aim(episode, true + episode.qpos[2], self._terrain_ahead(episode)),
             ],
             axis=1,
         )
@@ -507,6 +507,7 @@ class QuadrupedEnv(Env):
         self, before: Episode, after: Episode, below: jax.Array, around: jax.Array
     ) -> dict[str, jax.Array]:
         c = self.config.rewards
+        there = self._terrain_ahead(after)
         step = rewards.Step(
             velocity=after.qvel[:2],
             angular_velocity=after.qvel[3:6],
@@ -519,10 +520,12 @@ class QuadrupedEnv(Env):
             near=below[:, self._near],
             highest=jnp.min(below, axis=1),
             lift=after.controller.lift,
-            rise=jnp.maximum(jnp.max(around, axis=1) - after.lift_off, 0.0),
+            rise=jnp.maximum(
+                jnp.maximum(jnp.max(around, axis=1), jnp.max(there, axis=1)) - after.lift_off, 0.0
+            ),
             drift=tg.frames.yaw(after.qpos[3:7]) - after.heading,
         )
-        terms = rewards.step_terms(c, step) | {"aim": jnp.mean(self._aim(after, around))}
+        terms = rewards.step_terms(c, step) | {"aim": jnp.mean(self._aim(after, around, there))}
         if c.knee:
             _, knees = self._clearance(after)
             terms["knee"] = jnp.mean(rewards.knee(knees, c.knee_margin))
@@ -540,15 +543,19 @@ class QuadrupedEnv(Env):
         """The trunk's (2,) m/s, heading frame."""
         return tg.frames.turn(-tg.frames.yaw(episode.qpos[3:7]), episode.qvel[:2])
 
-    def _aim(self, episode: Episode, around: jax.Array) -> jax.Array:
+    def _terrain_ahead(self, episode: Episode) -> jax.Array:
+        """Terrain heights (L, P) m in the world, round the places where feet in swing will come down."""
+        return self._heights(episode, self.core.around(self.landing_points(episode))) + episode.qpos[2]
+
+    def _aim(self, episode: Episode, around: jax.Array, there: jax.Array) -> jax.Array:
         """Minus the share (L,) of low points where a foot in swing will come down; 0 in stance.
 
         Args:
           episode: what is judged.
           around: (L, P) m, terrain heights round the feet, world.
+          there: (L, P) m, and where those in swing will come down.
         """
-        offsets = jnp.asarray(tg.samples.ring_offsets(self.config.tg.sample_radius)[self._near], jnp.float32)
-        there = self._heights(episode, self.landing_points(episode)[:, None] + offsets) + episode.qpos[2]
+        there = there[:, self._near]
         highest = jnp.maximum(jnp.max(around, axis=1), jnp.max(there, axis=1))
         swing = self.core.phases(episode.controller.phase) > 0
         swing &= self.stepping(episode)

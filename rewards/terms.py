@@ -83,8 +83,9 @@ def terrain(
 def height(lift: jax.Array, rise: jax.Array, threshold: float) -> jax.Array:
     """r_height,i = -max(H + δh - ΔH - F_thre, 0).
 
-    ΔH is taken as the rise that the foot has to clear, max(max_j h_ij - h at lift-off, 0): the paper's "height
-    difference in the neighbouring environment" would be the depth of the pit on stepping stones.
+    ΔH is taken as the rise that the foot has to clear, max(max_j h_ij - h at lift-off, 0), by the samples round the
+    foot and round the place where it will come down: the paper's "height difference in the neighbouring environment"
+    would be the depth of the pit on stepping stones.
 
     Args:
       lift: (L,) m, H + δh.

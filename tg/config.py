@@ -6,6 +6,7 @@ BEFORE = {
     "look_ahead": False,
     "retraction": 0.0,
     "finish_step": False,
+    "look_ahead_from": 0.0,
     "follow": False,
     "sample_radius": 0.1,
     "touch_down": 0.0,
@@ -65,6 +66,9 @@ class TGConfig:
     look_ahead: bool = True
     """Sample the terrain round the place where a foot in swing ends its step; false: round the foot, as the paper
     does, so that the policy sees a foothold only when the foot is nearly there."""
+    look_ahead_from: float = -0.8
+    """Phase (rad) of a leg from which on it looks ahead: a little before it lifts off, when the foot height is chosen
+    that holds for the whole swing; 0: from lift-off on."""
     follow: bool = True
     """With `look_ahead`, sample the terrain round the place to which trajectory generator and residual joint angles
     together lead a foot, so that the policy sees the ground there closely; false: round the end of the trajectory

@@ -185,7 +185,7 @@ class Core:
         return self.around(self.centres(state, sensors))
 
     def centres(self, state: ControllerState, sensors: Sensors) -> Array:
-        """Centres (4, 2) m of the circles of `sample_points`: the feet, or where steps end (`look_ahead`, `follow`)."""
+        """Centres (4, 2) m of the circles of `sample_points`: the feet, or where steps end (`TGConfig.look_ahead`)."""
         feet = self.feet(sensors)[:, :2]
         if not self.config.look_ahead:
             return feet
@@ -194,7 +194,8 @@ class Core:
         if self.config.follow:
             ends = ends + self.residual_displacement(state, sensors)[:, :2]
         # A robot that stands still has feet in swing by their phase, but they stay where they are.
-        share = xp.where(self.phases(state.phase) > 0, state.gate, 0.0 * state.gate)[:, None]
+        ahead = self.phases(state.phase) > self.config.look_ahead_from
+        share = xp.where(ahead, state.gate, 0.0 * state.gate)[:, None]
         return feet + share * (ends - feet)
 
     def around(self, centres: Array) -> Array:
@@ -228,10 +229,11 @@ class Core:
         return (xp.reshape(state.targets[0], (4, 3)) - target) @ level.T
 
     def step_ends(self, state: ControllerState, sensors: Sensors, velocity: Array) -> Array:
-        """Where the trajectory generator leads feet in swing: (4, 2) m from the trunk's centre, heading frame.
+        """Where the trajectory generator leads feet: (4, 2) m from the trunk's centre, heading frame.
 
-        The end of the step, and the trunk's way until then at its velocity (2,) m/s. Residual joint angles are left
-        out, so that a foothold seen from there stays where it is while they lead the foot to it.
+        The end of the step, of feet in stance that of the next, and the trunk's way until then at its velocity (2,)
+        m/s. Residual joint angles are left out, so that a foothold seen from there stays where it is while they lead
+        the foot to it.
         """
         xp = state.targets.__array_namespace__()
         level = frames.heading_from_trunk(frames.up_in_trunk(sensors.orientation))
@@ -254,10 +256,11 @@ class Core:
         return self.step_ends(state, sensors, velocity) + moved[:, :2]
 
     def _time_left(self, state: ControllerState, xp: Any) -> Array:
-        """Time (4,) s until feet in swing come down."""
-        phases = self.phases(state.phase)
-        share = self.config.swing_share / math.pi
-        return share * xp.maximum(math.pi - phases, 0.0 * phases) / state.frequency
+        """Time (4,) s until feet come down that are in swing, or will be next."""
+        phases, share = self.phases(state.phase), self.config.swing_share
+        swing = xp.minimum(math.pi - phases, math.pi + 0.0 * phases)
+        stance = xp.maximum(-phases, 0.0 * phases)
+        return (share * swing + (1.0 - share) * stance) / (math.pi * state.frequency)
 
     def observe(
         self, state: ControllerState, sensors: Sensors, heights: Array | None, command: Array

@@ -126,9 +126,9 @@ class Supervisor:
         if self.last is None or not core.config.look_ahead:
             return np.full((4, 2), np.nan)
         sensors = tg.Sensors(**self.last.sensors)
-        swing = (core.phases(state.phase) > 0)[:, None]
+        ahead = (core.phases(state.phase) > core.config.look_ahead_from)[:, None]
         # The state is a step ahead of the sensors: that is when the next ones will be read.
-        return np.where(swing, core.centres(state, sensors), np.nan)
+        return np.where(ahead, core.centres(state, sensors), np.nan)
 
     def fault(self, message: Sensing | None, now: float) -> str:
         """What is wrong with a message, in one word; empty if it can be acted on."""

@@ -688,22 +688,35 @@ def test_aim_term_looks_where_the_feet_will_come_down(exact):
     low = (highest[:, None] - heights > c.gap_threshold).mean(axis=1)
     swing = tg.path.leg_phases(np.asarray(episode.controller.phase)) > 0
     assert swing.sum() == 2 and 0 < low[swing].mean()
-    np.testing.assert_allclose(env._aim(episode, around), -low * swing, atol=1e-6)
+    there = env._terrain_ahead(episode)
+    np.testing.assert_allclose(env._aim(episode, around, there), -low * swing, atol=1e-6)
     stands = change_episode(episode, command=np.zeros(2))
-    np.testing.assert_array_equal(env._aim(stands, around), 0)
+    np.testing.assert_array_equal(env._aim(stands, around, there), 0)
 
 
 def test_height_term_grants_what_the_terrain_rises(exact):
+    """Round the feet, and round the places where they will come down."""
     env, k = exact.env, exact.find("stairs", 9)
-    episode = episode_at(exact, k, standing(env, xy=(0.2, 0.0), z=0.2))
-    below, around = env._terrain_at_feet(episode)
-    rise = np.maximum(np.asarray(around).max(axis=1) - 0.0, 0)
-    assert rise.max() > 0.05 and rise.min() == 0
-    swing = tg.path.leg_phases(np.asarray(episode.controller.phase)) > 0
-    lift = np.asarray(episode.controller.lift)
-    expected = -(np.maximum(lift - rise - exact.config.rewards.lift_threshold, 0) * swing).mean()
-    terms = env._reward_terms(episode, change_episode(episode, lift_off=np.zeros(4)), below, around)
-    np.testing.assert_allclose(terms["height"], expected, atol=1e-6)
+    more = 0
+    for x in (0.1, 0.15, 0.2):
+        episode = episode_at(exact, k, standing(env, xy=(x, 0.0), z=0.2))
+        forward = episode.controller._replace(stride=jnp.array([1.0, 0.0]))
+        episode = change_episode(episode, controller=forward)
+        below, around = env._terrain_at_feet(episode)
+        where = (
+            np.asarray(env.landing_points(episode))[:, None] + np.array(tg.samples.ring_offsets()) + [x, 0.0]
+        )
+        ahead = terrains.exact_height(exact.terrain(k), cell_centres(env.bank, where)).max(axis=1)
+        here = np.asarray(around).max(axis=1)
+        rise = np.maximum(np.maximum(here, ahead), 0)
+        assert rise.min() == 0
+        swing = tg.path.leg_phases(np.asarray(episode.controller.phase)) > 0
+        more += (ahead > here + 0.05)[swing].sum()
+        lift = np.asarray(episode.controller.lift)
+        expected = -(np.maximum(lift - rise - exact.config.rewards.lift_threshold, 0) * swing).mean()
+        terms = env._reward_terms(episode, change_episode(episode, lift_off=np.zeros(4)), below, around)
+        np.testing.assert_allclose(terms["height"], expected, atol=1e-6)
+    assert more and rise.max() > 0.05
 
 
 def test_metrics_name_every_term(exact):

@@ -321,11 +321,12 @@ def test_points_lie_on_circles(subject, outer, third):
 
 
 def test_heights_are_wanted_where_steps_end(subject):
-    """Of feet in stance, of a robot that stands, and without look-ahead: round the feet."""
+    """Of feet early in stance, of a robot that stands, and without look-ahead: round the feet."""
     core, sensors = subject.core, random_sensors(subject.core, 3)
     core = dataclasses.replace(core, config=dataclasses.replace(core.config, follow=False))
     feet, state = core.feet(sensors)[:, :2], walk(core, 20)[-1][0]
-    swing = tg.path.leg_phases(state.phase) > 0
+    phases = tg.path.leg_phases(state.phase)
+    swing = phases > core.config.look_ahead_from
     assert swing.sum() == 2 and state.gate == 1
     ends = core.step_ends(state, sensors, core.odometry(state, sensors))
     expected = np.where(swing[:, None], ends, feet)
@@ -337,6 +338,11 @@ def test_heights_are_wanted_where_steps_end(subject):
     assert np.abs(moved)[swing].max() > 0.01
     expected = np.where(swing[:, None], ends + moved, feet)
     np.testing.assert_allclose(followed.sample_points(state, sensors), core.around(expected))
+    late = float(phases[~swing].max())
+    early = dataclasses.replace(core, config=dataclasses.replace(core.config, look_ahead_from=late - 0.01))
+    np.testing.assert_allclose(early.sample_points(state, sensors), core.around(ends))
+    left = (np.minimum(np.pi - phases, np.pi) + np.maximum(-phases, 0)) / (2 * np.pi * state.frequency)
+    np.testing.assert_allclose(core._time_left(state, np), left)
     behind = dataclasses.replace(core, config=dataclasses.replace(core.config, look_ahead=False))
     np.testing.assert_allclose(behind.sample_points(state, sensors), core.around(feet))
 
