@@ -26,6 +26,11 @@ from tlq.simulation import Simulation
 
 RISES = (0.03, 0.075, 0.12)
 """Stairs of the paper's figure (m)."""
+SHIPPED = {
+    "stairs": {"ours": "stairs_lift", "fixed_height": "mixed_fixed_height", "blind": "mixed_blind"},
+    "gaps": {"ours": "stones"},
+}
+"""Policies that come with tlq, by figure and method."""
 COURSES = ((0.085, 0.17, 0.255), (0.068, 0.204, 0.136))
 """Gaps of its two courses (m), in the order in which they are met."""
 
@@ -35,7 +40,7 @@ class Options:
     """What a user may set."""
 
     figure: str = option("stairs", "which", choices=lambda: ("stairs", "gaps"))
-    ours: str = option("", "policy of the paper's method; if none is given, mixed, for gaps stones")
+    ours: str = option("", "policy of the paper's method; if none is given at all, those that come with tlq")
     fixed_height: str = option("", "policy of that baseline")
     blind: str = option("", "policy of that baseline")
     picture: str = option("", "PNG file to write", required=True)
@@ -199,7 +204,7 @@ def main(arguments: Sequence[str]) -> None:
     options = cli.parse(Options, arguments, __doc__ or "")
     cli.check_folders(options, "picture", "json")
     if not chosen(options):
-        options = dataclasses.replace(options, ours={"stairs": "mixed", "gaps": "stones"}[options.figure])
+        options = dataclasses.replace(options, **SHIPPED[options.figure])
     if options.figure == "gaps" and not options.ours:
         raise ValueError("the figure of gaps is of the paper's method: set ours=")
     if options.seed < 0:

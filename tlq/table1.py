@@ -44,13 +44,14 @@ class Options:
 
 
 def policies() -> dict[tuple[str, str, str], str]:
-    """Names of the policies that come with tlq by (method, kind, terrain); generalists count for every terrain."""
+    """Names of the policies that come with tlq by (method, kind, terrain); generalists count for every terrain, of
+    several specialists the first in the index."""
     found: dict[tuple[str, str, str], str] = {}
     for name, about in json.loads((cli.POLICIES / "index.json").read_text()).items():
         if about["terrain"] == "mixed":
             found |= {(about["method"], "generalist", terrain): name for terrain in TERRAINS}
         elif about["terrain"] in TERRAINS:
-            found[about["method"], "specialist", about["terrain"]] = name
+            found.setdefault((about["method"], "specialist", about["terrain"]), name)
     return found
 
 

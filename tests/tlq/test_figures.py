@@ -45,6 +45,16 @@ def test_both_figures_are_written(tmp_path, capsys):
     assert "lift_median_m" in capsys.readouterr().out
 
 
+def test_the_lift_follows_the_stairs(tmp_path):
+    """By the shipped policy, over stairs of 3, 7.5 and 12 cm in MuJoCo C: about as high as each asks for."""
+    picture, numbers = tmp_path / "stairs.png", tmp_path / "stairs.json"
+    figures.main(["ours=stairs_lift", f"picture={picture}", f"json={numbers}"])
+    walks = list(json.loads(numbers.read_text()).values())
+    lifts = [walk["lift_median_m"] for walk in walks]
+    assert lifts[0] <= 0.045 and lifts[0] + 0.01 < lifts[1] < lifts[2] - 0.01
+    assert all(walk["distance_m"] == 5.0 and not walk["fell"] for walk in walks)
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_the_policy_for_stones_crosses_the_papers_gaps(tmp_path, seed):
     """In MuJoCo C, gaps of up to 25.5 cm; the hips swing wider over the widest gap than over the narrowest."""

@@ -11,6 +11,7 @@ INDEX = {
     "mixed": {"terrain": "mixed", "method": "ours"},
     "mixed-blind": {"terrain": "mixed", "method": "blind"},
     "flat": {"terrain": "flat", "method": "ours"},
+    "poles-for-something-else": {"terrain": "poles", "method": "ours"},
 }
 
 
