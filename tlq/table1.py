@@ -45,7 +45,8 @@ class Options:
 
 def policies() -> dict[tuple[str, str, str], str]:
     """Names of the policies that come with tlq by (method, kind, terrain); generalists count for every terrain, of
-    several specialists the first in the index."""
+    several specialists the first in the index.
+    """
     found: dict[tuple[str, str, str], str] = {}
     for name, about in json.loads((cli.POLICIES / "index.json").read_text()).items():
         if about["terrain"] == "mixed":
