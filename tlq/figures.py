@@ -151,7 +151,8 @@ def gaps(options: Options) -> tuple[Any, dict[str, Any]]:
         edges = gap_edges(terrain)
         trace = walk(options.ours, terrain, min(judge.GOAL, edges[-1][1] + 0.8))
         time = 0.02 * np.arange(len(trace.desired))
-        for leg, axis in enumerate(row[:2]):
+        *legs, hips = row
+        for leg, axis in enumerate(legs):
             for joint, name in enumerate(("abduction", "hip", "knee")):
                 axis.plot(time, trace.desired[:, 3 * leg + joint], lw=0.9, label=name)
             for start, end in edges:
@@ -163,10 +164,11 @@ def gaps(options: Options) -> tuple[Any, dict[str, Any]]:
             )
             axis.set_ylabel("desired angle (rad)")
         amplitudes = [amplitude(trace, start, end) for start, end in edges]
-        crossed = [(100 * w, a) for w, a in zip(course, amplitudes, strict=True) if a is not None]
-        row[2].plot(*zip(*sorted(crossed), strict=True) if crossed else ([], []), "C1.-")
-        row[2].set_ylabel("hip's amplitude (rad)")
-        row[2].set_ylim(bottom=0.0)
+        order = np.argsort(course)
+        # None, where no swing crossed a gap, becomes nan, which isn't drawn.
+        hips.plot(100 * np.array(course)[order], np.array(amplitudes, float)[order], "C1.-")
+        hips.set_ylabel("hip's amplitude (rad)")
+        hips.set_ylim(bottom=0.0)
         numbers[str(list(course))] = {
             "distance_m": trace.distance,
             "fell": trace.fell,

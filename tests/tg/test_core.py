@@ -341,10 +341,22 @@ def test_heights_are_wanted_where_steps_end(subject):
     late = float(phases[~swing].max())
     early = dataclasses.replace(core, config=dataclasses.replace(core.config, look_ahead_from=late - 0.01))
     np.testing.assert_allclose(early.sample_points(state, sensors), core.around(ends))
-    left = (np.minimum(np.pi - phases, np.pi) + np.maximum(-phases, 0)) / (2 * np.pi * state.frequency)
-    np.testing.assert_allclose(core._time_left(state, np), left)
     behind = dataclasses.replace(core, config=dataclasses.replace(core.config, look_ahead=False))
     np.testing.assert_allclose(behind.sample_points(state, sensors), core.around(feet))
+
+
+@pytest.mark.parametrize("share", [0.5, 0.3])
+@pytest.mark.parametrize("phase", [-2.5, -0.4, 0.7, 2.9])
+def test_time_left_until_feet_come_down(subject, share, phase):
+    """By letting the gait run on in steps of a tenth of a millisecond."""
+    core = dataclasses.replace(
+        subject.core, config=dataclasses.replace(subject.core.config, swing_share=share)
+    )
+    state = core.initial_state(np.array(phase))
+    times = 1e-4 * np.arange(10_000)
+    swing = core.phases(tg.path.wrap(phase + 2 * np.pi * float(state.frequency) * times)) > 0
+    landed = swing[:-1] & ~swing[1:]
+    np.testing.assert_allclose(core._time_left(state, np), times[1:][landed.argmax(axis=0)], atol=2e-4)
 
 
 def test_feet_land_where_the_generator_leads_them(subject):
