@@ -130,3 +130,6 @@ class EnvConfig:
     """A fall: the cosine of the trunk's tilt goes below this."""
     knee_radius: float = 0.02
     """The knees hit the terrain when they come this near (m)."""
+    knee_contact: bool = False
+    """A knee that hits the terrain pushes against it, as a foot does, and the robot goes on; else that ends the episode
+    as a fall does. In MuJoCo C thighs and shanks touch it, too."""

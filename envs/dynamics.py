@@ -9,7 +9,8 @@ They are solved leg by leg (Featherstone 2008, Rigid Body Dynamics Algorithms, s
 The batch is the last axis of every array, along which a processor's vector units work: (..., L, B). What is small is
 written out by components (`envs.algebra`), all in one frame T: the trunk's axes at its origin. Velocities of the trunk,
 which MuJoCo has in the world's axes, are turned into T and back; as that is a rotation, the solver takes the same
-steps. Units: m, rad, s, kg, N. Letters: B environments, L = 4 legs, N planes a foot, R rows of constraints.
+steps. Units: m, rad, s, kg, N. Letters: B environments, L = 4 legs, S spheres that touch the terrain (the feet, or feet
+and knees), N planes a sphere, R rows of constraints.
 """
 
 import functools
@@ -80,8 +81,8 @@ class Legs(NamedTuple):
     """Points on them (m), (3, L, B)."""
     frames: Matrix
     """Of the links, (3, L, B)."""
-    feet: Vector
-    """Centres of the feet (m), (L, B)."""
+    spheres: tuple[Vector, ...]
+    """Centres (m) of what touches the terrain, (L, B): of the feet, and of the knees if these do."""
 
 
 def pin(tree: Any) -> Any:
@@ -181,12 +182,12 @@ def moved(a: Joints, alpha: Component, b: Joints) -> Joints:
 
 
 class Contacts(NamedTuple):
-    """What one plane a foot does."""
+    """What one plane a foot does, or one a knee."""
 
     jacobian: jax.Array
     """(3, 9, L, B): speed of the point that touches along normal and two tangents, by what a leg sees."""
     mass: jax.Array
-    """(L, B): D, regularised mass of each edge of the pyramid; 0 where the foot doesn't touch."""
+    """(L, B): D, regularised mass of each edge of the pyramid; 0 where it doesn't touch."""
     aref: jax.Array
     """(4, L, B): acceleration of reference along each of the edges."""
 
@@ -507,20 +508,37 @@ def _impedance(model: mujoco.MjModel, solref: np.ndarray, solimp: np.ndarray) ->
     return Impedance(constant(stiffness), constant(damping), tuple(parts), float(max(power.flat[0], 1.0)))
 
 
+class Sphere(NamedTuple):
+    """What touches the terrain at each leg: its foot, or its knee."""
+
+    link: int
+    """Of a leg, to which it belongs: 2 the shank, 1 the thigh."""
+    centre: Vector
+    """In the link's frame, from its joint (m), (L, 1)."""
+    radius: Component
+    """m."""
+    weight: Component
+    """Inverse weight of the link, `body_invweight0`."""
+    impedance: list[Impedance]
+    """Of each plane."""
+    margin: list[Component]
+    """m, likewise."""
+
+
 class TreeDynamics:
     """The substep of one robot.
 
     Args:
       model: of `physics.physics_model`.
-      planes: (L, N) geom ids of the terrain's planes.
-      feet: (L,) geom ids of the feet.
+      planes: (S, N) geom ids of the terrain's planes.
+      spheres: (S,) geom ids of the spheres that touch them: the feet, then the knees if these do.
 
     Raises:
       ValueError: the model has something that isn't covered here.
     """
 
-    def __init__(self, model: mujoco.MjModel, planes: np.ndarray, feet: np.ndarray):
-        reason = not_covered(model, planes, feet)
+    def __init__(self, model: mujoco.MjModel, planes: np.ndarray, spheres: np.ndarray):
+        reason = not_covered(model, planes, spheres)
         if reason:
             raise ValueError(reason)
         self.timestep = float(model.opt.timestep)
@@ -529,11 +547,11 @@ class TreeDynamics:
         self.tolerance = float(model.opt.tolerance * model.opt.ls_tolerance)
         self.impratio = float(model.opt.impratio)
         self.friction = float(model.pair_friction[0, 0])
-        bodies = _chains(model, feet)
+        bodies = _chains(model, spheres[:NUM_LEGS])
         self._read_trunk(model, int(model.body_parentid[bodies[0, 0]]))
-        self._read_links(model, bodies, feet)
+        self._read_links(model, bodies)
         self._read_joints(model, bodies)
-        self._read_contacts(model, bodies, planes, feet)
+        self._read_contacts(model, bodies, planes, spheres)
 
     def _read_trunk(self, model: mujoco.MjModel, trunk: int) -> None:
         turn = _matrices(model.body_iquat[trunk])
@@ -542,7 +560,7 @@ class TreeDynamics:
         self.trunk_matrix = algebra.symmetric(matrix.tolist())
         self.trunk_centre = columns(model.body_ipos[trunk][None])
 
-    def _read_links(self, model: mujoco.MjModel, bodies: np.ndarray, feet: np.ndarray) -> None:
+    def _read_links(self, model: mujoco.MjModel, bodies: np.ndarray) -> None:
         """Each link in a frame of its own, at its joint's anchor and with the joint's axis as x; links first."""
         bodies = bodies.T
         joints = model.body_jntadr[bodies]
@@ -559,9 +577,7 @@ class TreeDynamics:
         matrix = np.einsum("jlab,jlb,jlcb->jlac", principal, model.body_inertia[bodies], principal)
         self.matrix = algebra.symmetric(matrix_columns(matrix))
         self.mass = constant(model.body_mass[bodies])
-        foot = model.geom_pos[feet] - anchor[-1]
-        self.foot = columns(np.einsum("lba,lb->la", along[-1], foot))
-        self.radius = constant(model.geom_size[feet, 0])
+        self.anchor, self.along = anchor, along
 
     def _read_joints(self, model: mujoco.MjModel, bodies: np.ndarray) -> None:
         joints = model.body_jntadr[bodies.T]
@@ -576,19 +592,32 @@ class TreeDynamics:
         self.limit = _impedance(model, model.jnt_solref[joints], model.jnt_solimp[joints])
 
     def _read_contacts(
-        self, model: mujoco.MjModel, bodies: np.ndarray, planes: np.ndarray, feet: np.ndarray
+        self, model: mujoco.MjModel, bodies: np.ndarray, planes: np.ndarray, spheres: np.ndarray
     ) -> None:
-        pairs = _pairs(model, planes, feet)
-        self.num_planes = planes.shape[1]
-        self.contact = [_impedance(model, model.pair_solref[p], model.pair_solimp[p]) for p in pairs.T]
-        self.contact_margin = [constant(model.pair_margin[p]) for p in pairs.T]
-        self.contact_weight = constant(model.body_invweight0[bodies[:, -1], 0])
+        pairs = _pairs(model, planes, spheres)
+        self.spheres: list[Sphere] = []
+        for first in range(0, len(spheres), NUM_LEGS):
+            mine, link = spheres[first : first + NUM_LEGS], LEG_JOINTS - 1 - first // NUM_LEGS
+            off = model.geom_pos[mine] - self.anchor[link]
+            planes_of = pairs[first : first + NUM_LEGS].T
+            self.spheres.append(
+                Sphere(
+                    link=link,
+                    centre=columns(np.einsum("lba,lb->la", self.along[link], off)),
+                    radius=constant(model.geom_size[mine, 0]),
+                    weight=constant(model.body_invweight0[bodies[:, link], 0]),
+                    impedance=[
+                        _impedance(model, model.pair_solref[p], model.pair_solimp[p]) for p in planes_of
+                    ],
+                    margin=[constant(model.pair_margin[p]) for p in planes_of],
+                )
+            )
 
     # -- the substep
 
-    def feet(self, qpos: jax.Array) -> jax.Array:
-        """Centres of the feet (L, 3) m in the world of a pose (19,)."""
-        return _batched(self._feet)(qpos)
+    def centres(self, qpos: jax.Array) -> jax.Array:
+        """Centres (S, 3) m of the spheres in the world of a pose (19,)."""
+        return _batched(self._centres)(qpos)
 
     def substep(
         self,
@@ -608,15 +637,15 @@ class TreeDynamics:
           qvel: (18,).
           warmstart: (18,) last accelerations.
           qfrc: (18,) generalised force.
-          contact: surfaces near the feet, a `physics.Contact`.
+          contact: surfaces near the spheres, a `physics.Contact`.
           iterations: Newton iterations of the constraint solver.
           payload: () kg on the trunk.
-          friction: () of the feet, instead of the model's.
+          friction: () of feet and knees, instead of the model's.
 
         Returns:
           The next qpos, qvel and warmstart.
         """
-        centres = self.feet(qpos)
+        centres = self.centres(qpos)
         _, normal, point = contact(centres)
         friction = self.friction if friction is None else friction
         numbers = (jnp.asarray(x, jnp.float32) for x in (payload, friction))
@@ -640,14 +669,16 @@ class TreeDynamics:
         payload: jax.Array,
         friction: jax.Array,
     ) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """`substep` of a batch (..., B), given normals and ways from the feet to the planes (L, N, 3, B)."""
+        """`substep` of a batch (..., B), given normals and ways from the centres to the planes (S, N, 3, B)."""
         quaternion, world, legs = self._pose(qpos)
         velocity = self._joints(world, qvel)
         mu = jnp.maximum(friction, mujoco.mjMINVAL)
         contacts = []
-        for plane in range(self.num_planes):
-            n, w = ((a[:, plane, 0], a[:, plane, 1], a[:, plane, 2]) for a in (normal, way))
-            contacts.append(self._contacts(legs, world, plane, velocity, n, w, mu))
+        for i in range(len(self.spheres)):
+            mine = slice(i * NUM_LEGS, (i + 1) * NUM_LEGS)
+            for plane in range(len(self.spheres[i].impedance)):
+                n, w = ((a[mine, plane, 0], a[mine, plane, 1], a[mine, plane, 2]) for a in (normal, way))
+                contacts.append(self._contacts(legs, world, i, plane, velocity, n, w, mu))
         limits = self._limits(qpos[self.qpos_ids], velocity.legs)
         matrix, bias = self._smooth(legs, world, velocity, payload)
         force = difference(self._joints(world, qfrc), bias)
@@ -659,10 +690,13 @@ class TreeDynamics:
         qvel = qvel + self.timestep * acceleration
         return self._integrated(qpos, quaternion, qvel), qvel, acceleration
 
-    def _feet(self, qpos: jax.Array) -> jax.Array:
+    def _centres(self, qpos: jax.Array) -> jax.Array:
         _, world, legs = self._pose(qpos)
-        feet = apply(world, legs.feet)
-        return jnp.stack([x + base for x, base in zip(feet, qpos[:3], strict=True)], axis=1)
+        parts = []
+        for centre in legs.spheres:
+            there = apply(world, centre)
+            parts.append(jnp.stack([x + base for x, base in zip(there, qpos[:3], strict=True)], axis=1))
+        return jnp.concatenate(parts)
 
     def _pose(self, qpos: jax.Array) -> tuple[list[Component], Matrix, Legs]:
         """The trunk's quaternion, its axes in the world, and the legs, of (19, B)."""
@@ -692,13 +726,16 @@ class TreeDynamics:
             frame = x, plus(scaled(c, y), scaled(s, z)), minus(scaled(c, z), scaled(s, y))
             origin, frame = pin((origin, frame))
             found.append((origin, frame))
-        feet = pin(plus(origin, apply(frame, self.foot)))
+        spheres = []
+        for sphere in self.spheres:
+            joint, turn = found[sphere.link]
+            spheres.append(pin(plus(joint, apply(turn, sphere.centre))))
 
         def stack(*parts: Component) -> jax.Array:
             return jnp.stack([jnp.broadcast_to(x, angles.shape[1:]) for x in parts])
 
         anchors, frames = pin(jax.tree.map(stack, *found))
-        return Legs(frames[0], anchors, frames, feet)
+        return Legs(frames[0], anchors, frames, tuple(spheres))
 
     def _smooth(
         self, legs: Legs, world: Matrix, velocity: Joints, payload: Component
@@ -753,34 +790,41 @@ class TreeDynamics:
         self,
         legs: Legs,
         world: Matrix,
+        sphere: int,
         plane: int,
         velocity: Joints,
         normal: Vector,
         way: Vector,
         mu: jax.Array,
     ) -> Contacts:
-        """Of the feet with one plane each.
+        """Of the feet, or the knees, with one plane each.
 
         Args:
           legs: in T.
           world: the axes of T in the world.
-          plane: which of a foot's planes.
+          sphere: which of `spheres`.
+          plane: which of its planes.
           velocity: generalised.
           normal: unit vector out of the terrain, in the world.
-          way: from the foot's centre to a point of the plane, in the world (m).
+          way: from the centre to a point of the plane, in the world (m).
           mu: friction (B,).
         """
-        dist = -dot(way, normal) - self.radius
+        it, centre = self.spheres[sphere], legs.spheres[sphere]
+        dist = -dot(way, normal) - it.radius
         n, s, t = pin(_tangents(normal))
         frame = pin((_into(world, n), _into(world, s), _into(world, t)))
-        point = pin(minus(legs.feet, scaled(self.radius + 0.5 * dist, frame[0])))
-        arms = pin(cross(legs.axes, minus(point, legs.anchors)))
+        point = pin(minus(centre, scaled(it.radius + 0.5 * dist, frame[0])))
+        arms = cross(legs.axes, minus(point, legs.anchors))
+        if it.link < LEG_JOINTS - 1:  # joints beyond the link don't move it
+            moving = (np.arange(LEG_JOINTS) <= it.link).astype(np.float32)[:, None, None]
+            arms = scaled(moving, arms)
+        arms = pin(arms)
         jacobian = pin(
             jnp.stack([jnp.concatenate([jnp.stack([*d, *cross(point, d)]), dot(arms, d)]) for d in frame])
         )
-        weight = self.contact_weight * (1.0 + mu * mu) * 2.0 * mu * mu / self.impratio
-        impedance = self.contact[plane]
-        mass, aref = _row(impedance, weight, dist - self.contact_margin[plane])
+        weight = it.weight * (1.0 + mu * mu) * 2.0 * mu * mu / self.impratio
+        impedance = it.impedance[plane]
+        mass, aref = _row(impedance, weight, dist - it.margin[plane])
         return Contacts(jacobian, mass, aref - impedance.damping * edges(jacobian, velocity.each, mu))
 
     def _integrated(self, qpos: jax.Array, quaternion: list[Component], qvel: jax.Array) -> jax.Array:
@@ -877,12 +921,12 @@ def _chains(model: mujoco.MjModel, feet: np.ndarray) -> np.ndarray:
     return np.stack([model.body_parentid[thighs], thighs, shanks], axis=1)
 
 
-def _pairs(model: mujoco.MjModel, planes: np.ndarray, feet: np.ndarray) -> np.ndarray:
-    """(L, N) ids of the contact pairs."""
+def _pairs(model: mujoco.MjModel, planes: np.ndarray, spheres: np.ndarray) -> np.ndarray:
+    """(S, N) ids of the contact pairs."""
     ids = {
         (int(a), int(b)): i for i, (a, b) in enumerate(zip(model.pair_geom1, model.pair_geom2, strict=True))
     }
-    return np.array([[ids[int(p), int(f)] for p in row] for row, f in zip(planes, feet, strict=True)])
+    return np.array([[ids[int(p), int(f)] for p in row] for row, f in zip(planes, spheres, strict=True)])
 
 
 def _batched(function: Any) -> Any:
@@ -903,9 +947,9 @@ def _batched(function: Any) -> Any:
     return single
 
 
-def not_covered(model: mujoco.MjModel, planes: np.ndarray, feet: np.ndarray) -> str:
+def not_covered(model: mujoco.MjModel, planes: np.ndarray, spheres: np.ndarray) -> str:
     """What of a model this substep doesn't compute, so that MJX has to; "" if nothing."""
-    shanks = model.geom_bodyid[feet]
+    shanks = model.geom_bodyid[spheres[:NUM_LEGS]]
     hinges = (
         (model.nq, model.nv, model.njnt) == (19, 18, 13) and model.nbody == 14 and _is_tree(model, shanks)
     )
@@ -924,7 +968,10 @@ def not_covered(model: mujoco.MjModel, planes: np.ndarray, feet: np.ndarray) -> 
         ("a fluid", option.density or option.viscosity or option.wind.any()),
         ("compensation of gravity", model.body_gravcomp.any()),
         ("equalities, tendons or motors", model.neq or model.ntendon or model.nu),
-        ("other contacts than the feet's", model.npair != planes.size or (model.geom_contype > 0).any()),
+        (
+            "other contacts than the feet's and the knees'",
+            model.npair != planes.size or (model.geom_contype > 0).any(),
+        ),
         ("contacts with other than sliding friction", np.any(model.pair_dim != 3)),
         ("friction that differs", np.ptp(model.pair_friction[:, :2]) > 0),
         (

@@ -38,7 +38,10 @@ class QuadrupedEnv(Env):
         check(config)
         self.config = config
         self.bank = make_bank(config) if bank is None else bank
-        self.mj_model, self.robot = physics.physics_model(config.robot, config.physics_dt, config.num_planes)
+        knees = config.knee_radius if config.knee_contact else 0.0
+        self.mj_model, self.robot = physics.physics_model(
+            config.robot, config.physics_dt, config.num_planes, knees
+        )
         self.core = make_core(config, self.robot)
         self.standing = physics.settle(self.mj_model, self.robot, self.core.standing_target)
         self.substeps = round(config.control_dt / config.physics_dt)
@@ -47,6 +50,7 @@ class QuadrupedEnv(Env):
         self._model = mjx.put_model(self.mj_model)
         self._data = mjx.make_data(self._model)
         self._planes = physics.plane_ids(self.mj_model, config.num_planes)
+        self._spheres = physics.sphere_ids(self.mj_model)
         self._tree = self._make_tree()
         self._near = tg.samples.within(config.rewards.terrain_ring, config.tg.sample_radius)
         self._instances, self._counts = self._by_kind()
@@ -439,10 +443,9 @@ class QuadrupedEnv(Env):
 
     def _make_tree(self) -> TreeDynamics | None:
         """The substep for this robot alone, None where MJX is wanted or has to do."""
-        feet = self.robot.foot_geom_ids
-        if self.config.dynamics == "mjx" or not_covered(self.mj_model, self._planes, feet):
+        if self.config.dynamics == "mjx" or not_covered(self.mj_model, self._planes, self._spheres):
             return None
-        return TreeDynamics(self.mj_model, self._planes, feet)
+        return TreeDynamics(self.mj_model, self._planes, self._spheres)
 
     def _substep(self, r: Randomised, contact: physics.Contact) -> Callable[..., tuple[jax.Array, ...]]:
         """A timestep as a function of qpos, qvel, warmstart and generalised force that returns the first three."""
@@ -463,8 +466,7 @@ class QuadrupedEnv(Env):
             qpos: jax.Array, qvel: jax.Array, warmstart: jax.Array, qfrc: jax.Array
         ) -> tuple[jax.Array, ...]:
             data = self._data.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart)
-            feet = self.robot.foot_geom_ids
-            data = physics.substep(model, data, self._planes, feet, contact, qfrc, iterations)
+            data = physics.substep(model, data, self._planes, self._spheres, contact, qfrc, iterations)
             return data.qpos, data.qvel, data.qacc_warmstart
 
         return substep
@@ -562,10 +564,14 @@ class QuadrupedEnv(Env):
         return rewards.terrain(swing, -there, -highest, self.config.rewards.gap_threshold, graded=True)
 
     def _fell(self, episode: Episode, below: jax.Array, around: jax.Array) -> jax.Array:
-        """Whether trunk or a knee hits the terrain, the trunk tilts too far, or a foot is in a gap."""
+        """Whether trunk or (unless those push it) a knee hits the terrain, the trunk tilts too far, or a foot is in a
+        gap.
+        """
         c = self.config
         trunk, knees = self._clearance(episode)
-        hit = jnp.any(trunk < 0) | jnp.any(knees < 0)
+        hit = jnp.any(trunk < 0)
+        if not c.knee_contact:
+            hit |= jnp.any(knees < 0)
         fell = hit | (tg.frames.rotation(episode.qpos[3:7])[2, 2] < c.min_up)
         if c.end_in_gap:
             top = jnp.max(around, axis=1)
@@ -619,6 +625,8 @@ def check(config: EnvConfig) -> None:
         raise ValueError(
             f"control_dt={config.control_dt} must be a whole multiple of physics_dt={config.physics_dt}"
         )
+    if config.knee_contact and config.knee_radius == 0:
+        raise ValueError("knee_radius=0 must be above 0 with knee_contact=true")
     if len(config.curriculum.difficulty) != len(config.curriculum.depth) or not config.curriculum.depth:
         raise ValueError(
             "curriculum.difficulty and curriculum.depth must have the same number of levels, at least 1"

@@ -19,14 +19,20 @@ from envs.robot import Robot, RobotConfig, read_robot, robot_spec
 from envs.robots.quadruped import LEGS
 
 FEET = tuple(f"{leg}_foot" for leg in LEGS)
+KNEES = tuple(f"{leg}_knee" for leg in LEGS)
 
 Contact = Callable[[jax.Array], tuple[jax.Array, jax.Array, jax.Array]]
-"""Foot centres (L, 3) m to the N nearest surfaces: distance (L, N) m, normal (L, N, 3), surface point (L, N, 3) m."""
+"""Centres (S, 3) m of spheres to the N nearest surfaces: distance (S, N) m, normal (S, N, 3), surface point (S, N, 3)
+m. S: the feet, L, or feet and knees, 2 L.
+"""
 
 
-def physics_model(config: RobotConfig, timestep: float, num_planes: int) -> tuple[mujoco.MjModel, Robot]:
+def physics_model(
+    config: RobotConfig, timestep: float, num_planes: int, knee_radius: float = 0.0
+) -> tuple[mujoco.MjModel, Robot]:
     """The robot with `num_planes` terrain planes a foot and no motors (torques are applied to the joints).
 
+    With a `knee_radius` (m) its knees are spheres that touch the terrain as feet do, with as many planes each.
     The robot's ids in the returned record hold for this model; `Robot.motor_ids` do not.
     """
     spec = robot_spec(config)
@@ -34,17 +40,27 @@ def physics_model(config: RobotConfig, timestep: float, num_planes: int) -> tupl
     for actuator in list(spec.actuators):
         spec.delete(actuator)
     spec.option.timestep = timestep
-    for foot in FEET:
-        add_planes(spec, foot, num_planes, config.foot_friction)
+    for leg, knee in zip(LEGS, KNEES, strict=True) if knee_radius else ():
+        spec.body(f"{leg}_thigh").add_geom(
+            name=knee,
+            type=mujoco.mjtGeom.mjGEOM_SPHERE,
+            size=(knee_radius, 0, 0),
+            pos=spec.body(f"{leg}_shank").pos,
+            contype=0,
+            conaffinity=0,
+            mass=0.0,
+        )
+    for sphere in FEET + KNEES if knee_radius else FEET:
+        add_planes(spec, sphere, num_planes, config.foot_friction)
     model = spec.compile()
     # The world's geoms come before the robot's, so the feet have other ids now.
     return model, dataclasses.replace(robot, foot_geom_ids=np.array([model.geom(foot).id for foot in FEET]))
 
 
-def add_planes(spec: mujoco.MjSpec, foot: str, num_planes: int, friction: float) -> None:
-    """Adds terrain planes to a model, each paired with a foot's geom and touching nothing else."""
+def add_planes(spec: mujoco.MjSpec, sphere: str, num_planes: int, friction: float) -> None:
+    """Adds terrain planes to a model, each paired with a foot's geom, or a knee's, and touching nothing else."""
     for plane in range(num_planes):
-        name = f"{foot}_plane{plane}"
+        name = f"{sphere}_plane{plane}"
         spec.worldbody.add_geom(
             name=name,
             type=mujoco.mjtGeom.mjGEOM_PLANE,
@@ -55,12 +71,21 @@ def add_planes(spec: mujoco.MjSpec, foot: str, num_planes: int, friction: float)
             conaffinity=0,
             rgba=(0, 0, 0, 0),
         )
-        spec.add_pair(geomname1=name, geomname2=foot, condim=3, friction=[friction] * 2 + [0.005, 1e-4, 1e-4])
+        spec.add_pair(
+            geomname1=name, geomname2=sphere, condim=3, friction=[friction] * 2 + [0.005, 1e-4, 1e-4]
+        )
 
 
-def plane_ids(model: mujoco.MjModel, num_planes: int, feet: Sequence[str] = FEET) -> np.ndarray:
-    """(L, num_planes) geom ids of the terrain planes."""
-    return np.array([[model.geom(f"{foot}_plane{i}").id for i in range(num_planes)] for foot in feet])
+def sphere_ids(model: mujoco.MjModel) -> np.ndarray:
+    """(S,) geom ids of what touches the terrain in a `physics_model`: the feet, then the knees if they do."""
+    names = {model.geom(i).name for i in range(model.ngeom)}
+    return np.array([model.geom(name).id for name in FEET + KNEES if name in names])
+
+
+def plane_ids(model: mujoco.MjModel, num_planes: int, spheres: Sequence[str] = ()) -> np.ndarray:
+    """(S, num_planes) geom ids of the terrain planes; of other spheres than `sphere_ids` by their names."""
+    spheres = spheres or [model.geom(i).name for i in sphere_ids(model)]
+    return np.array([[model.geom(f"{name}_plane{i}").id for i in range(num_planes)] for name in spheres])
 
 
 def frame(normal: jax.Array) -> jax.Array:
@@ -77,7 +102,7 @@ def substep(
     model: mjx.Model,
     data: mjx.Data,
     planes: np.ndarray,
-    feet: np.ndarray,
+    spheres: np.ndarray,
     contact: Contact,
     qfrc: jax.Array,
     iterations: int,
@@ -87,15 +112,15 @@ def substep(
     Args:
       model: of `physics_model`, on the device.
       data: state.
-      planes: (L, N) geom ids.
-      feet: (L,) geom ids.
-      contact: surfaces near the feet.
+      planes: (S, N) geom ids.
+      spheres: (S,) geom ids.
+      contact: surfaces near them.
       qfrc: (nv,) generalised force.
       iterations: Newton iterations of the constraint solver.
     """
     with jax.default_matmul_precision("highest"):  # TF32, a GPU's default, ruins contact
         data = mjx.kinematics(model, data)
-        _, normal, point = contact(data.geom_xpos[feet])
+        _, normal, point = contact(data.geom_xpos[spheres])
         ids = planes.reshape(-1)
         data = data.replace(
             geom_xpos=data.geom_xpos.at[ids].set(point.reshape(-1, 3)),

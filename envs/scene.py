@@ -35,6 +35,7 @@ def build_scene(
     path: np.ndarray | None = None,
     reach: float = 3.0,
     limbs: bool = False,
+    touch: bool = False,
 ) -> mujoco.MjModel:
     """The robot on a terrain (without one: on a plane); only feet and ground collide, at the feet's friction.
 
@@ -47,14 +48,15 @@ def build_scene(
         physics is the same: what collides is hidden in group 3, and a coloured copy without contact is drawn.
       path: (N, 2) horizontal positions, m; draw only ground within `reach` of one of them.
       reach: m.
-      limbs: give thighs and shanks capsules without contact, which hide the ground from range sensors.
+      limbs: give thighs and shanks capsules, which hide the ground from range sensors.
+      touch: let these collide with the ground, at the feet's friction (and give them).
     """
     spec = robot_spec(config, look=look)
     spec.option.timestep = timestep
     spec.option.iterations = iterations
     spec.option.ls_iterations = 50
-    if limbs:
-        _add_limbs(spec)
+    if limbs or touch:
+        _add_limbs(spec, config.foot_friction if touch else 0.0)
     group = HIDDEN_GROUP if look else 0
     if terrain is None:
         spec.worldbody.add_geom(
@@ -74,8 +76,8 @@ def build_scene(
     return spec.compile()
 
 
-def _add_limbs(spec: mujoco.MjSpec) -> None:
-    """Capsules along thighs and shanks."""
+def _add_limbs(spec: mujoco.MjSpec, friction: float) -> None:
+    """Capsules along thighs and shanks; with a friction they collide with the ground."""
     for name in LEGS:
         thigh, shank, foot = spec.body(f"{name}_thigh"), spec.body(f"{name}_shank"), spec.site(f"{name}_foot")
         for body, end, radius in zip((thigh, shank), (shank.pos, foot.pos), LIMBS, strict=True):
@@ -84,7 +86,9 @@ def _add_limbs(spec: mujoco.MjSpec) -> None:
                 size=(radius, 0, 0),
                 fromto=(0, 0, 0, *end),
                 contype=0,
-                conaffinity=0,
+                conaffinity=int(friction > 0),
+                friction=(friction, 0.005, 0.0001),
+                priority=1,
                 group=HIDDEN_GROUP,
                 mass=0.0,
             )

@@ -15,6 +15,9 @@ and hit nothing in it, the ground lies below them. That is how a gap between pol
 seen. After Fankhauser et al., Robot-Centric Elevation Mapping with Uncertainty Estimates (CLAWAR 2014), whose map has
 no bounds.
 
+A pose estimate slips, and edges with it. So each scan is also laid on the map: moved and turned a little, as far as the
+estimate may have slipped, to where its rays end, and go on, as earlier ones did (scan matching on an occupancy grid).
+
 Where an edge is, single points don't tell: a range that is off by 2 cm puts a point beside it. So a cell counts the
 rays that meet its surface: those that end there, and those that go on deeper. Where a ray meets a surface doesn't
 depend on its range, only whether it ends there does.
@@ -70,15 +73,29 @@ class ElevationConfig:
     """...or within this (m)."""
     reach: int = 1
     """Where a cell isn't measured its surface, if it has one, is the highest within so many cells."""
-    solid: float = 0.65
+    solid: float = 0.6
     """A cell is ground if at least this share of the rays that meet its surface end there. More than a half: a ray that
     meets a gap near its far side ends on the wall, hardly below the edge..."""
-    trust: float = 1.0
+    trust: float = 0.5
     """...and it is to begin with: so many rays are taken to have ended there."""
-    memory: float = 0.2
+    memory: float = 0.3
     """Rays count for 1 / e after the robot has walked so far (m): the pose estimate drifts, and edges with it."""
+    slip: float = 0.02
+    """Error that the pose estimate is taken to gain while the robot walks a metre, standard deviation in x and in y
+    (m); grows with the root of the way. Scans are laid on the map as far as that allows; 0: as the estimate says."""
+    slip_turn: float = 0.01
+    """The same of the heading (rad)."""
+    weight: float = 0.3
+    """A scan's likelihood counts for so much: its rays tell less than if each erred by itself, and the map isn't the
+    truth."""
     hole: float = 0.3
     """Depth (m) of a hole whose floor isn't seen. Deeper than what the policy tells apart, 0.25 m."""
+
+
+def turned(angle: float, places: np.ndarray) -> np.ndarray:
+    """Vectors (..., 2) turned to the left (rad)."""
+    cos, sin = np.cos(angle), np.sin(angle)
+    return places @ np.array([[cos, sin], [-sin, cos]])
 
 
 class ElevationMap:
@@ -107,10 +124,24 @@ class ElevationMap:
         """Height (m) where nothing is known near and far."""
         self.position = np.zeros(2)
         """(2,) m, the robot's last one."""
+        self.shift, self.turn = np.zeros(2), 0.0
+        """(2,) m and rad: what is told in the pose estimate's frame is turned, then moved, onto the map."""
+        self.slipped = np.zeros((3, 3))
+        """Covariance of the robot's x, y (m) and heading (rad) on the map."""
         self.centre = np.zeros(2, int)
         """(2,) the cell under the robot; the map holds those from `centre` - N / 2 to `centre` + N / 2 - 1."""
 
     # -- where
+
+    def onto(self, places: np.ndarray) -> np.ndarray:
+        """Places (..., 2 or 3) m of the pose estimate's frame, laid on the map; z stays."""
+        level = turned(self.turn, places[..., :2]) + self.shift
+        return np.concatenate([level, places[..., 2:]], axis=-1)
+
+    def back(self, places: np.ndarray) -> np.ndarray:
+        """`onto` the other way."""
+        level = turned(-self.turn, places[..., :2] - self.shift)
+        return np.concatenate([level, places[..., 2:]], axis=-1)
 
     def cells_of(self, places: np.ndarray) -> np.ndarray:
         """Cells (..., 2) of the frame in which places (..., 2 or more) m lie."""
@@ -141,6 +172,8 @@ class ElevationMap:
         self.bound[:] = False
         self.stopped[:] = self.went_on[:] = 0.0
         self.ground = ground
+        self.shift, self.turn = np.zeros(2), 0.0
+        self.slipped[:] = 0.0
         self.position = np.array(position[:2], float)
         self.centre = self.cells_of(self.position)
         if min(half_size) > 0:
@@ -154,7 +187,8 @@ class ElevationMap:
         """Rolls the map to a new position (2,) m of the robot; what comes in anew is unknown, heights lose
         certainty.
         """
-        n, centre = self.config.cells, self.cells_of(np.asarray(position[:2], float))
+        position = self.onto(np.asarray(position[:2], float))
+        n, centre = self.config.cells, self.cells_of(position)
         way = float(np.hypot(*(position[:2] - self.position)))
         shift = centre - self.centre
         kept = ((self.variance, np.inf), (self.bound, False), (self.stopped, 0.0), (self.went_on, 0.0))
@@ -166,6 +200,8 @@ class ElevationMap:
                 np.moveaxis(values.reshape(n, n), axis, 0)[new] = unknown
         self.centre, self.position = centre, np.array(position[:2], float)
         self.variance += way * self.config.drift**2
+        slip, turn = self.config.slip**2, self.config.slip_turn**2
+        self.slipped += way * np.diag([slip, slip, turn])
         self.stopped *= np.exp(-way / self.config.memory)
         self.went_on *= np.exp(-way / self.config.memory)
 
@@ -184,13 +220,15 @@ class ElevationMap:
         """
         if not len(points):
             return
-        origin = np.broadcast_to(origin, points.shape)
+        origin, points = self.onto(np.broadcast_to(origin, points.shape)), self.onto(points)
+        odds = self._odds()
         where, measured, _ = self._tops(points, variance)
         self._follow(where, measured)
         surface = self._surface()
         tolerance = np.maximum(self.config.stop * np.sqrt(variance), self.config.least_stop)
-        self._stop(origin, points, surface, tolerance)
-        low = self._passes(origin, points, surface, tolerance)
+        ended = self._stop(origin, points, surface, tolerance)
+        low, went_on = self._passes(origin, points, surface, tolerance)
+        self._align(odds, ended, went_on)
         solid = self.solid()
         where, measured, spread = self._tops(points, variance)
         seen = solid[where] | self._floor(where, measured, surface[where])
@@ -213,7 +251,7 @@ class ElevationMap:
         A cell that isn't measured is taken to be as low as the lowest that is known in the smallest square round it in
         which anything is: what is hidden is hidden by something higher. A hole is taken to be deep.
         """
-        cells = self.cells_of(np.asarray(places, float)).reshape(-1, 2)
+        cells = self._nearest(self.onto(np.asarray(places, float)).reshape(-1, 2))
         found, missing = self._seen(cells)
         for ring in self.config.rings:
             if not len(missing):
@@ -232,13 +270,35 @@ class ElevationMap:
         centres = (cells + 0.5) * self.config.cell
         where = self.index(cells)
         known = self._measured()[where] & (np.hypot(*(centres - self.position).T) <= reach)
-        return np.column_stack([centres, self.height[where]])[known]
+        return self.back(np.column_stack([centres, self.height[where]])[known])
 
     # -- parts of it
 
     def _measured(self) -> np.ndarray:
         """Whether something was seen in cells (N·N,)."""
         return np.isfinite(self.variance) & ~self.bound
+
+    def _nearest(self, places: np.ndarray) -> np.ndarray:
+        """The cells (K, 2) that tell of places (K, 2) m: those in which they lie, but where some of the four round a
+        place are ground and some aren't, the nearest that is what the place is by the four together.
+        """
+        c = self.config
+        own = self.cells_of(places)
+        at = places / c.cell - 0.5
+        low = np.floor(at).astype(int)
+        corners = low[:, None] + np.array([[0, 0], [0, 1], [1, 0], [1, 1]])
+        where = self.index(corners)
+        apart = at[:, None] - corners
+        weight = np.prod(1.0 - np.abs(apart), axis=-1)
+        stopped = self.stopped[where] + c.trust
+        share = stopped / (stopped + self.went_on[where])
+        ground = share >= c.solid
+        mixed = np.isfinite(self.variance[where]).all(axis=1) & ground.any(axis=1) & ~ground.all(axis=1)
+        mixed &= self.inside(corners).all(axis=1)
+        here = (weight * share).sum(axis=1) >= c.solid
+        away = np.where(ground == here[:, None], (apart**2).sum(axis=-1), np.inf)
+        best = corners[np.arange(len(places)), away.argmin(axis=1)]
+        return np.where(mixed[:, None] & np.isfinite(away.min(axis=1))[:, None], best, own)
 
     def _seen(self, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Heights (C,) m of cells (C, 2), and the numbers of those that were not seen and are no holes.
@@ -346,24 +406,27 @@ class ElevationMap:
 
     def _stop(
         self, origin: np.ndarray, points: np.ndarray, surface: np.ndarray, tolerance: np.ndarray
-    ) -> None:
+    ) -> np.ndarray:
         """Counts in `stopped` the rays that end within a tolerance (M,) m of a surface, in the cells where they meet
-        it.
+        it; returns where, (K, 2) m.
         """
         away = surface[self.index(self.cells_of(points))] - points[:, 2]
         near = self.inside(self.cells_of(points)) & (np.abs(away) <= tolerance)
         back = (origin - points)[near]
         share = away[near] / np.maximum(back[:, 2], tolerance[near])
-        cells = self.cells_of(points[near, :2] + share[:, None] * back[:, :2])
-        met = self.index(cells[self.inside(cells)])
-        self.stopped += np.bincount(met, minlength=len(self.stopped))
+        places = points[near, :2] + share[:, None] * back[:, :2]
+        cells = self.cells_of(places)
+        inside = self.inside(cells)
+        self.stopped += np.bincount(self.index(cells[inside]), minlength=len(self.stopped))
+        return places[inside]
 
     def _passes(
         self, origin: np.ndarray, points: np.ndarray, surface: np.ndarray, tolerance: np.ndarray
-    ) -> np.ndarray:
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Heights (N·N,) m of the lowest ray over each cell, infinite where none passes, near the rays' ends only.
 
-        Counts in `went_on` the rays that meet a cell's surface and end more than a tolerance (M,) m below it.
+        Counts in `went_on` the rays that meet a cell's surface and end more than a tolerance (M,) m below it; also
+        returns where in each such cell they are, (K, 2) m.
         """
         c = self.config
         back = origin - points
@@ -382,7 +445,50 @@ class ElevationMap:
         keep &= before
         low = np.full(len(self.height), np.inf)
         np.minimum.at(low, where[keep], z[keep])
-        return low
+        return low, on[meets, :2]
+
+    def _odds(self) -> np.ndarray:
+        """Logarithm of the odds (N, N) that a ray which meets a cell's surface ends there, smoothed over 3 x 3."""
+        n, trust = self.config.cells, self.config.trust
+        odds = np.log((self.stopped + trust) / (self.went_on + trust)).reshape(n, n)
+        for axis in range(2):
+            odds = 0.5 * odds + 0.25 * (np.roll(odds, 1, axis) + np.roll(odds, -1, axis))
+        return odds
+
+    def _align(self, odds: np.ndarray, ended: np.ndarray, went_on: np.ndarray) -> None:
+        """Moves and turns what comes next onto the map, so that rays end, and go on, where earlier ones did.
+
+        A Kalman update: how far the estimate may have slipped is the prior, and the likelihood is that of these rays at
+        the odds that the map gives each, to the second order (Fisher's information).
+
+        Args:
+          odds: (N, N), before this scan.
+          ended: (K, 2) m, on the map, where rays met a surface and ended.
+          went_on: (K', 2) m, where they were below one.
+        """
+        c, n = self.config, self.config.cells
+        if not self.slipped.any():
+            return
+        places = np.concatenate([ended, went_on])
+        outcome = np.concatenate([np.ones(len(ended)), np.zeros(len(went_on))])
+        at = places / c.cell - 0.5  # in cells, centres at whole numbers
+        low = np.floor(at).astype(int)
+        x, y = (at - low).T
+        (i, j), (i2, j2) = (low % n).T, ((low + 1) % n).T
+        h00, h10, h01, h11 = odds[i, j], odds[i2, j], odds[i, j2], odds[i2, j2]
+        value = (1 - x) * ((1 - y) * h00 + y * h01) + x * ((1 - y) * h10 + y * h11)
+        slope_x = ((1 - y) * (h10 - h00) + y * (h11 - h01)) / c.cell
+        slope_y = ((1 - x) * (h01 - h00) + x * (h11 - h10)) / c.cell
+        away = places - self.position
+        slopes = np.stack([slope_x, slope_y, away[:, 0] * slope_y - away[:, 1] * slope_x])
+        chance = 1.0 / (1.0 + np.exp(-value))
+        pull = c.weight * slopes @ (outcome - chance)
+        information = c.weight * (slopes * (chance * (1.0 - chance))) @ slopes.T
+        self.slipped = np.linalg.solve(np.eye(3) + self.slipped @ information, self.slipped)
+        change = self.slipped @ pull
+        # The robot is moved by the first two, and turned about where it is.
+        self.shift = self.position + change[:2] + turned(float(change[2]), self.shift - self.position)
+        self.turn += float(change[2])
 
     def _measure(self, where: np.ndarray, measured: np.ndarray, spread: np.ndarray) -> None:
         """Kalman updates of cells (C,) by heights (C,) m with variances (C,) m²."""

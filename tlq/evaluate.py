@@ -32,6 +32,7 @@ from tlq.senses import SensingOptions, check_use, described
 ENGINES = ("mjx", "mujoco")
 DIRECTIONS = (0.0, math.pi / 4, -math.pi / 4, -math.pi, -5 * math.pi / 4, -3 * math.pi / 4)
 """The paper's, rad; episode k takes number k % 6."""
+KNEES = ("training", "fall", "touch")
 FIRST_SEED = 10_000
 """Training's terrains have seeds below."""
 STOOD = 3.0
@@ -59,6 +60,11 @@ class Options(SensingOptions):
         "none", "file of a safety monitor, or name of one that comes with tlq; engine=mujoco only"
     )
     workers: int = option(1, "processes; engine=mujoco only")
+    knees: str = option(
+        "training",
+        "what a knee that hits the terrain does: fall ends the episode, touch pushes it back; training: as there",
+        choices=lambda: KNEES,
+    )
 
 
 def evaluate(options: Options, report: Callable[[str], None] = print) -> dict[str, Any]:
@@ -121,7 +127,8 @@ def _walk_mjx(options: Options, path: Path, metadata: dict[str, Any], report: An
     sizes = terrains.TerrainConfig(kind=options.terrain, num_terrains=count, seed=FIRST_SEED + options.seed)
     level = terrains.parse_difficulty(options.difficulty)
     report(f"building {count} terrains, compiling")
-    env = envs.make(batch.evaluation_config(training_env(metadata), sizes, level, options.noise))
+    config = walked_in(metadata, options.knees)
+    env = envs.make(batch.evaluation_config(config, sizes, level, options.noise))
     began = time.monotonic()
 
     def progress(tally: judge.Tally) -> None:
@@ -133,6 +140,20 @@ def _walk_mjx(options: Options, path: Path, metadata: dict[str, Any], report: An
     phases = np.array([start_phase(k) for k in range(count)])
     found = batch.walk(load_policy(path), env, directions, phases, seed=options.seed, report=progress)
     return [judge.Tally(*(leaf[k] for leaf in found)) for k in range(count)]
+
+
+def what_knees_do(metadata: dict[str, Any], knees: str) -> str:
+    """fall or touch, given one of `KNEES`."""
+    if knees != "training":
+        return knees
+    trained = metadata.get("training", {}).get("env", {})
+    return "touch" if trained.get("knee_contact", False) else "fall"
+
+
+def walked_in(metadata: dict[str, Any], knees: str) -> envs.EnvConfig:
+    """The environment in which a policy was trained, with one of `KNEES`."""
+    touch = what_knees_do(metadata, knees) == "touch"
+    return dataclasses.replace(training_env(metadata), knee_contact=touch)
 
 
 class Walk(NamedTuple):
@@ -177,7 +198,7 @@ def mujoco_walk(
     from tlq.simulation import Simulation
 
     controller = Controller(path)
-    config = training_env(controller.metadata)
+    config = walked_in(controller.metadata, options.knees)
     seed = FIRST_SEED + options.seed
     terrain = terrains.make_terrain(options.terrain, options.difficulty, seed, index=k)
     noise = config.randomisation if options.noise else None
@@ -259,6 +280,7 @@ def summary(
         "episodes": len(runs),
         "seed": options.seed,
         "noise": options.noise,
+        "knees": what_knees_do(metadata, options.knees),
         "perception": described(options.sensing()),
         "monitor": _monitored(options, watched),
         "method": metadata["method"],
@@ -345,6 +367,7 @@ def table(result: dict[str, Any]) -> str:
         )
         rows.append(("monitor", said))
     head = "{terrain}, difficulty {difficulty:g}, {engine}, {episodes} episodes".format(**result)
+    head += ", knees touch" if result["knees"] == "touch" else ""
     return "\n".join([head, *(f"{name:<18}{value}" for name, value in rows)])
 
 

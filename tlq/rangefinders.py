@@ -31,8 +31,8 @@ class LidarConfig:
     """Shortest range (m)."""
     deviation: float = 0.02
     """Standard deviation of the range (m); the manufacturer has at most 2 cm at 10 m, and 3 cm at 0.2 m."""
-    rays: int = 640
-    """Points a control step. Assumed: the sensor gives 4,000; a sixth of them is enough, and is what time allows here.
+    rays: int = 2000
+    """Points a control step. Assumed: the sensor gives 4,000; half of them is what time allows here.
     Taken from an even sequence (Roberts' R2) in place of the manufacturer's rosette; those that can't end on the ground
     near the robot aren't cast."""
     pitch: float = math.radians(35.0)

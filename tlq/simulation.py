@@ -49,7 +49,8 @@ class Simulation:
                 f"timestep={timestep} doesn't divide the control period, {controller.control_dt} s"
             )
         self.controller, self.terrain, self.config, self.noise = controller, terrain, config, noise
-        self.model = build_scene(config.robot, terrain, timestep=timestep, limbs=perception is not None)
+        limbs, touch = perception is not None, config.knee_contact
+        self.model = build_scene(config.robot, terrain, timestep=timestep, limbs=limbs, touch=touch)
         self.data = mujoco.MjData(self.model)
         self.robot = read_robot(self.model, config.robot)
         self.substeps = round(ratio)
@@ -116,7 +117,9 @@ class Simulation:
         return float(tg.frames.yaw(self.data.qpos[3:7]))
 
     def fell(self) -> bool:
-        """Whether trunk or a knee hits the terrain, or the trunk tilts too far; as in `QuadrupedEnv`."""
+        """Whether trunk or (unless those push it) a knee hits the terrain, or the trunk tilts too far; as in
+        `QuadrupedEnv`.
+        """
         rotation = tg.frames.rotation(self.data.qpos[3:7])
         q = self.data.qpos[self._q].reshape(4, 3)
         knees = self._thighs.hip_position + tg.leg.forward(self._thighs, q)
@@ -124,6 +127,8 @@ class Simulation:
         if not np.isfinite(points).all():
             return True
         points[-4:, 2] -= self.config.knee_radius
+        if self.config.knee_contact:
+            points = points[:-4]
         hit = points[:, 2] < exact_height(self.terrain, points[:, :2])
         return bool(hit.any() or rotation[2, 2] < self.config.min_up)
 

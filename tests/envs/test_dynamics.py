@@ -17,9 +17,10 @@ TILTS = np.array([[0, 0, 1], [0.6, 0, 0.8]], np.float32)
 """Normals of the planes under every foot: level ground, and a slope that begins 2 cm lower."""
 
 
-def make(name, num_planes=1):
+def make(name, num_planes=1, knees=0.0):
     """Model, record of the robot and the planes' ids; "random": every body turned and weighed in a way of its own."""
-    model, robot = physics.physics_model(RobotConfig("max" if name == "random" else name), 0.005, num_planes)
+    config = RobotConfig("max" if name == "random" else name)
+    model, robot = physics.physics_model(config, 0.005, num_planes, knees)
     if name == "random":
         rng = np.random.default_rng(5)
         turned = lambda n: rng.normal(0, 0.3, (n, 4)) + [1, 0, 0, 0]  # noqa: E731
@@ -56,7 +57,7 @@ def states(standing, count=BATCH):
 
 def slopes(num_planes):
     def contact(centre):
-        normal = jnp.broadcast_to(TILTS[:num_planes], (4, num_planes, 3))
+        normal = jnp.broadcast_to(TILTS[:num_planes], (len(centre), num_planes, 3))
         distance = jnp.sum(centre[:, None] * normal, axis=-1) + jnp.array([0.0, 0.02])[:num_planes]
         return distance, normal, centre[:, None] - distance[..., None] * normal
 
@@ -75,7 +76,7 @@ def by_mjx(model, robot, planes, iterations):
         )
         data = empty.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart)
         contact = slopes(planes.shape[1])
-        data = physics.substep(changed, data, planes, robot.foot_geom_ids, contact, force, iterations)
+        data = physics.substep(changed, data, planes, physics.sphere_ids(model), contact, force, iterations)
         return data.qpos, data.qvel, data.qacc_warmstart
 
     return one
@@ -83,7 +84,7 @@ def by_mjx(model, robot, planes, iterations):
 
 def by_tree(model, robot, planes, iterations):
     """The same without MJX."""
-    tree, contact = TreeDynamics(model, planes, robot.foot_geom_ids), slopes(planes.shape[1])
+    tree, contact = TreeDynamics(model, planes, physics.sphere_ids(model)), slopes(planes.shape[1])
 
     def one(qpos, qvel, warmstart, force, payload, friction):
         return tree.substep(qpos, qvel, warmstart, force, contact, iterations, payload, friction)
@@ -94,7 +95,7 @@ def by_tree(model, robot, planes, iterations):
 @pytest.mark.parametrize("name", ["max", pytest.param("go1_size", marks=pytest.mark.slow), "random"])
 def test_mass_matrix_and_bias_are_mujocos(name):
     model, robot, planes = make(name)
-    tree = TreeDynamics(model, planes, robot.foot_geom_ids)
+    tree = TreeDynamics(model, planes, physics.sphere_ids(model))
     qpos, qvel, *_ = states(robot.standing_qpos, 8)
     matrix, bias = jax.tree.map(np.asarray, jax.jit(tree.smooth)(qpos.T, qvel.T))
     data, full = mujoco.MjData(model), np.zeros((18, 18))
@@ -117,16 +118,19 @@ def test_mass_matrix_and_bias_are_mujocos(name):
 
 
 @pytest.mark.parametrize(
-    "name, num_planes, iterations",
+    "name, num_planes, iterations, knees",
     [
-        ("max", 1, EnvConfig().solver_iterations),
-        pytest.param("random", 2, 4, marks=pytest.mark.slow),
-        pytest.param("go1_size", 2, 1, marks=pytest.mark.slow),
-        pytest.param("max", 1, 1, marks=pytest.mark.slow),
+        ("max", 1, EnvConfig().solver_iterations, 0.0),
+        # So large that most of those that stand touch the ground.
+        ("max", 1, EnvConfig().solver_iterations, 0.2),
+        pytest.param("random", 2, 4, 0.0, marks=pytest.mark.slow),
+        pytest.param("random", 2, 4, 0.12, marks=pytest.mark.slow),
+        pytest.param("go1_size", 2, 1, 0.0, marks=pytest.mark.slow),
+        pytest.param("max", 1, 1, 0.0, marks=pytest.mark.slow),
     ],
 )
-def test_a_substep_is_mjxs(name, num_planes, iterations):
-    model, robot, planes = make(name, num_planes)
+def test_a_substep_is_mjxs(name, num_planes, iterations, knees):
+    model, robot, planes = make(name, num_planes, knees)
     given = states(robot.standing_qpos)
     ours, theirs = (
         jax.tree.map(np.asarray, jax.jit(jax.vmap(how(model, robot, planes, iterations)))(*given))

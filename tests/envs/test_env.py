@@ -291,6 +291,9 @@ def test_knees_touch_the_ground(exact):
         lowered[2] += height - knee
         assert lowered[2] > exact.env.robot.trunk_half_size[2] + 0.02
         assert judged(exact, qpos=lowered) == expected
+    # Where knees push the ground, that is no fall.
+    touching = with_config(exact, dataclasses.replace(exact.config, knee_contact=True))
+    assert not judged(exact, env=touching, qpos=lowered)
 
 
 def test_tilt(exact):

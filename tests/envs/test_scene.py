@@ -34,6 +34,22 @@ def test_stands_on_the_platform_of_every_terrain(kind):
     assert model.opt.timestep == 0.002
 
 
+def test_legs_that_touch_push_the_ground():
+    """Thighs and shanks collide with it at the feet's friction, with nothing else, and only if asked to."""
+    bare, limbs, touching = (build_scene(CONFIG, **how) for how in ({}, {"limbs": True}, {"touch": True}))
+    assert limbs.ngeom == touching.ngeom == bare.ngeom + 8
+    assert (limbs.geom_conaffinity > 0).sum() == (bare.geom_conaffinity > 0).sum()
+    legs = np.flatnonzero(
+        (touching.geom_conaffinity > 0) & (touching.geom_type == mujoco.mjtGeom.mjGEOM_CAPSULE)
+    )
+    assert len(legs) == 8 and not touching.geom_contype[legs].any()
+    np.testing.assert_allclose(touching.geom_friction[legs, 0], CONFIG.foot_friction)
+    np.testing.assert_array_equal(touching.body_mass, bare.body_mass)
+    robot, data = stand(touching, 0.2)
+    _, plain = stand(bare, 0.2)
+    np.testing.assert_allclose(data.qpos, plain.qpos, atol=1e-9)
+
+
 def test_look_leaves_the_motion_as_it_is():
     terrain = terrains.make_terrain("poles", "paper", seed=3)
     _, plain = stand(build_scene(CONFIG, terrain), 0.2)

@@ -157,6 +157,27 @@ def test_summary_adds_up():
     assert "2.667 m" in text and "poles, difficulty 0.8, mjx, 3 episodes" in text
 
 
+def test_knees_are_those_of_training_unless_asked_otherwise(file, tmp_path):
+    """A robot let down onto its knees has fallen, or stands on them."""
+    metadata = Controller(file).metadata
+    assert evaluate.what_knees_do(metadata, "training") == evaluate.what_knees_do({}, "training") == "fall"
+    assert evaluate.what_knees_do({"training": {"env": {"knee_contact": True}}}, "training") == "touch"
+    for knees, fallen in (("fall", True), ("touch", False)):
+        config = evaluate.walked_in(metadata, knees)
+        simulation = Simulation(Controller(file), terrains.make_terrain("flat", "paper", 0), config)
+        robot, data = simulation.robot, simulation.data
+        # Thighs hang down, shanks are folded up: what is lowest are the knees.
+        data.qpos[robot.qpos_ids] = np.tile([0.0, 0.0, 2.3], 4)
+        data.qpos[2] = 0.2115 + 0.015
+        assert simulation.fell() == fallen
+        desired, lowest = data.qpos[robot.qpos_ids].copy(), []
+        for _ in range(150):
+            simulation.substep(desired)
+            lowest.append(data.xpos[robot.knee_ids, 2].min())
+        # Half of a second later they carry the robot, or it has sunk through the ground to its feet.
+        assert (min(lowest) > 0.01) == (not fallen)
+
+
 def test_nothing_walked_is_no_division_by_zero():
     tally = judge.begin(moment())._replace(ended=judge.FELL, steps=1.0)
     found = evaluate.summary(evaluate.Options(), {"control_dt": DT, "method": "ours", "commit": ""}, [tally])
@@ -303,6 +324,7 @@ def test_engines_are_the_same_at_the_same_settings(tmp_path):
         (["engine=bullet"], "unknown engine 'bullet'; choose one of mjx, mujoco"),
         (["episode=3"], "unknown setting 'episode' .did you mean episodes"),
         (["episodes=two"], "episodes=two isn't a whole number"),
+        (["knees=bend"], "unknown knees 'bend'; choose one of training, fall, touch"),
         (["noise=maybe"], "noise=maybe isn't true or false"),
         (["poles"], "'poles' isn't of the form key=value"),
         ([], "policy= is missing"),
