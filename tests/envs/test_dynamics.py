@@ -158,7 +158,7 @@ def test_what_isnt_covered_is_named():
     model, robot, planes = make("max")
     feet = robot.foot_geom_ids
     assert not_covered(model, planes, feet) == ""
-    assert not_covered(make("go1_size", 2)[0], planes=np.zeros((4, 2)), feet=feet + 4) == ""
+    assert not_covered(make("go1_size", 2)[0], planes=np.zeros((4, 2)), spheres=feet + 4) == ""
     rubbing, _ = physics.physics_model(RobotConfig(joint_friction=0.5), 0.005, 1)
     assert not_covered(rubbing, planes, feet) == "joint friction"
     with pytest.raises(ValueError, match="joint friction"):
