@@ -549,9 +549,9 @@ class TreeDynamics:
         self.friction = float(model.pair_friction[0, 0])
         bodies = _chains(model, spheres[:NUM_LEGS])
         self._read_trunk(model, int(model.body_parentid[bodies[0, 0]]))
-        self._read_links(model, bodies)
+        anchors, along = self._read_links(model, bodies)
         self._read_joints(model, bodies)
-        self._read_contacts(model, bodies, planes, spheres)
+        self.spheres = _spheres(model, bodies, planes, spheres, anchors, along)
 
     def _read_trunk(self, model: mujoco.MjModel, trunk: int) -> None:
         turn = _matrices(model.body_iquat[trunk])
@@ -560,8 +560,11 @@ class TreeDynamics:
         self.trunk_matrix = algebra.symmetric(matrix.tolist())
         self.trunk_centre = columns(model.body_ipos[trunk][None])
 
-    def _read_links(self, model: mujoco.MjModel, bodies: np.ndarray) -> None:
-        """Each link in a frame of its own, at its joint's anchor and with the joint's axis as x; links first."""
+    def _read_links(self, model: mujoco.MjModel, bodies: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Each link in a frame of its own, at its joint's anchor and with the joint's axis as x; links first.
+
+        Returns the anchors (3, L, 3) m, and these frames' axes as columns (3, L, 3, 3), in the bodies' frames.
+        """
         bodies = bodies.T
         joints = model.body_jntadr[bodies]
         anchor, own = model.jnt_pos[joints], _matrices(model.body_quat[bodies])
@@ -577,7 +580,7 @@ class TreeDynamics:
         matrix = np.einsum("jlab,jlb,jlcb->jlac", principal, model.body_inertia[bodies], principal)
         self.matrix = algebra.symmetric(matrix_columns(matrix))
         self.mass = constant(model.body_mass[bodies])
-        self.anchor, self.along = anchor, along
+        return anchor, along
 
     def _read_joints(self, model: mujoco.MjModel, bodies: np.ndarray) -> None:
         joints = model.body_jntadr[bodies.T]
@@ -590,28 +593,6 @@ class TreeDynamics:
         self.armature = np.eye(3)[..., None] * model.dof_armature[self.dof_ids][:, None]
         self.joint_weight = constant(model.dof_invweight0[self.dof_ids])
         self.limit = _impedance(model, model.jnt_solref[joints], model.jnt_solimp[joints])
-
-    def _read_contacts(
-        self, model: mujoco.MjModel, bodies: np.ndarray, planes: np.ndarray, spheres: np.ndarray
-    ) -> None:
-        pairs = _pairs(model, planes, spheres)
-        self.spheres: list[Sphere] = []
-        for first in range(0, len(spheres), NUM_LEGS):
-            mine, link = spheres[first : first + NUM_LEGS], LEG_JOINTS - 1 - first // NUM_LEGS
-            off = model.geom_pos[mine] - self.anchor[link]
-            planes_of = pairs[first : first + NUM_LEGS].T
-            self.spheres.append(
-                Sphere(
-                    link=link,
-                    centre=columns(np.einsum("lba,lb->la", self.along[link], off)),
-                    radius=constant(model.geom_size[mine, 0]),
-                    weight=constant(model.body_invweight0[bodies[:, link], 0]),
-                    impedance=[
-                        _impedance(model, model.pair_solref[p], model.pair_solimp[p]) for p in planes_of
-                    ],
-                    margin=[constant(model.pair_margin[p]) for p in planes_of],
-                )
-            )
 
     # -- the substep
 
@@ -927,6 +908,33 @@ def _pairs(model: mujoco.MjModel, planes: np.ndarray, spheres: np.ndarray) -> np
         (int(a), int(b)): i for i, (a, b) in enumerate(zip(model.pair_geom1, model.pair_geom2, strict=True))
     }
     return np.array([[ids[int(p), int(f)] for p in row] for row, f in zip(planes, spheres, strict=True)])
+
+
+def _spheres(
+    model: mujoco.MjModel,
+    bodies: np.ndarray,
+    planes: np.ndarray,
+    spheres: np.ndarray,
+    anchors: np.ndarray,
+    along: np.ndarray,
+) -> list[Sphere]:
+    """The feet, and the knees if these touch the terrain; anchors, along: of `TreeDynamics._read_links`."""
+    pairs, found = _pairs(model, planes, spheres), []
+    for first in range(0, len(spheres), NUM_LEGS):
+        mine, link = spheres[first : first + NUM_LEGS], LEG_JOINTS - 1 - first // NUM_LEGS
+        off = model.geom_pos[mine] - anchors[link]
+        each = pairs[first : first + NUM_LEGS].T
+        found.append(
+            Sphere(
+                link=link,
+                centre=columns(np.einsum("lba,lb->la", along[link], off)),
+                radius=constant(model.geom_size[mine, 0]),
+                weight=constant(model.body_invweight0[bodies[:, link], 0]),
+                impedance=[_impedance(model, model.pair_solref[p], model.pair_solimp[p]) for p in each],
+                margin=[constant(model.pair_margin[p]) for p in each],
+            )
+        )
+    return found
 
 
 def _batched(function: Any) -> Any:

@@ -82,9 +82,9 @@ class ElevationConfig:
     """Rays count for 1 / e after the robot has walked so far (m): the pose estimate drifts, and edges with it."""
     slip: float = 0.02
     """Error that the pose estimate is taken to gain while the robot walks a metre, standard deviation in x and in y
-    (m); grows with the root of the way. Scans are laid on the map as far as that allows; 0: as the estimate says."""
+    (m); grows with the root of the way. Scans are laid on the map as far as that allows; 0: only turned."""
     slip_turn: float = 0.01
-    """The same of the heading (rad)."""
+    """The same of the heading (rad); 0: only moved."""
     weight: float = 0.3
     """A scan's likelihood counts for so much: its rays tell less than if each erred by itself, and the map isn't the
     truth."""
@@ -298,7 +298,7 @@ class ElevationMap:
         here = (weight * share).sum(axis=1) >= c.solid
         away = np.where(ground == here[:, None], (apart**2).sum(axis=-1), np.inf)
         best = corners[np.arange(len(places)), away.argmin(axis=1)]
-        return np.where(mixed[:, None] & np.isfinite(away.min(axis=1))[:, None], best, own)
+        return np.where(mixed[:, None], best, own)
 
     def _seen(self, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Heights (C,) m of cells (C, 2), and the numbers of those that were not seen and are no holes.
