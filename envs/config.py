@@ -114,6 +114,8 @@ class EnvConfig:
     """Longest episode (s)."""
     stand_share: float = 0.05
     """Share of the episodes that command standing."""
+    straight_share: float = 0.0
+    """Share of the episodes that command walking straight ahead or straight back; the others any direction."""
     stop_share: float = 0.2
     """Share of the others in which the robot is told once, at a random time, to stand for a while."""
     stop_time: tuple[float, float] = (1.0, 3.0)

@@ -128,7 +128,7 @@ class QuadrupedEnv(Env):
             "yaw",
             "heading",
             "tilt",
-            *(("knee",) if self.config.rewards.knee else ()),
+            *(name for name in ("heave", "knee") if getattr(self.config.rewards, name)),
         )
         ends = ("ended", "distance", "length", "fell", "level", "exploded")
         kinds = (f"{part}/{kind}" for kind in self.mixture for part in ("share", "level"))
@@ -166,6 +166,8 @@ class QuadrupedEnv(Env):
         # At ±π/2 every foot is in the middle of its step: fading in the stride pushes the robot neither way.
         phase = jnp.where(jax.random.bernoulli(next(keys)), 0.5, -0.5) * jnp.float32(jnp.pi)
         walk = jax.random.uniform(next(keys)) >= c.stand_share
+        if c.straight_share:
+            angle = self._draw_straight(jax.random.fold_in(key, 13), yaw, angle)
         command = jnp.where(walk, jnp.stack([jnp.cos(angle), jnp.sin(angle)]), 0.0)
         ground = terrains.height(self.bank, place, xy)
         qpos = jnp.asarray(self.standing, jnp.float32)
@@ -195,6 +197,12 @@ class QuadrupedEnv(Env):
             randomised=self._randomise(next(keys)),
             key=next(keys),
         )
+
+    def _draw_straight(self, key: jax.Array, yaw: jax.Array, angle: jax.Array) -> jax.Array:
+        """A direction () rad, or in `straight_share` of the episodes that of the nose or against it, yaw () rad."""
+        straight, back = jax.random.uniform(key, (2,))
+        ahead = yaw + jnp.where(back < 0.5, 0.0, jnp.float32(jnp.pi))
+        return jnp.where(straight < self.config.straight_share, ahead, angle)
 
     def _draw_stop(self, key: jax.Array) -> jax.Array:
         """`Episode.stop`: (0, 0) in most episodes."""
@@ -531,6 +539,8 @@ class QuadrupedEnv(Env):
         if c.knee:
             _, knees = self._clearance(after)
             terms["knee"] = jnp.mean(rewards.knee(knees, c.knee_margin))
+        if c.heave:
+            terms["heave"] = -jnp.square(after.qvel[2])
         return terms
 
     def landing_points(self, episode: Episode) -> jax.Array:

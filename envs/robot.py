@@ -51,8 +51,10 @@ class RobotConfig:
     foot_friction: float = 0.8
     """Sliding friction between foot and terrain, whatever the terrain's own."""
     foot_height: float = -0.33
-    """Height of a resting foot under its hip joint, m: the base position is (0, side * offset, foot_height)
-    from the abduction joint."""
+    """Height of a resting foot under its hip joint, m: the base position is
+    (0, side * (offset + foot_spread), foot_height) from the abduction joint."""
+    foot_spread: float = 0.0
+    """How far a resting foot stands outside its hip joint, m."""
     file: ModelFile = dataclasses.field(default_factory=ModelFile)
     """Model file to read the robot from instead; its path is empty by default."""
 
@@ -105,7 +107,7 @@ class Robot:
     default_pose: np.ndarray
     """(J,) joint angles of the base foot positions, knees behind the hips, rad."""
     base_foot: np.ndarray
-    """(L, 3) base foot position (0, side * offset, foot_height) from the abduction joint, m."""
+    """(L, 3) base foot position (0, side * (offset + foot_spread), foot_height) from the abduction joint, m."""
     foot_radius: float
     """m."""
     trunk_half_size: np.ndarray
@@ -184,7 +186,7 @@ def read_robot(model: mujoco.MjModel, config: RobotConfig) -> Robot:
     _check_legs(offset, thigh, shank, axes)
     signs = np.stack([axes[:, 0, 0], axes[:, 1, 1], axes[:, 2, 1]], axis=1)
     base = np.zeros((len(LEGS), 3))
-    base[:, 1] = offset[:, 1]
+    base[:, 1] = offset[:, 1] + np.sign(offset[:, 1]) * config.foot_spread
     base[:, 2] = config.foot_height
     half = model.geom_size[model.geom("trunk").id].copy()
     return Robot(
@@ -207,7 +209,7 @@ def read_robot(model: mujoco.MjModel, config: RobotConfig) -> Robot:
         joint_upper=model.jnt_range[joints, 1],
         torque_limit=model.actuator_ctrlrange[motors, 1],
         speed_limit=_speed_limit(model),
-        default_pose=_standing_pose(-thigh[:, 2], -shank[:, 2], signs, config.foot_height),
+        default_pose=_standing_pose(offset[:, 1], -thigh[:, 2], -shank[:, 2], signs, base),
         base_foot=base,
         foot_radius=float(model.geom_size[feet[0], 0]),
         trunk_half_size=half,
@@ -248,17 +250,25 @@ def _check_legs(offset: np.ndarray, thigh: np.ndarray, shank: np.ndarray, axes: 
         )
 
 
-def _standing_pose(thigh: np.ndarray, shank: np.ndarray, signs: np.ndarray, height: float) -> np.ndarray:
-    """Angles (J,) that put each foot straight under its hip joint, knee behind it (law of cosines)."""
-    cosine = (height**2 - thigh**2 - shank**2) / (2 * thigh * shank)
+def _standing_pose(
+    offset: np.ndarray, thigh: np.ndarray, shank: np.ndarray, signs: np.ndarray, base: np.ndarray
+) -> np.ndarray:
+    """Angles (J,) that put the feet at their base positions (L, 3), knees behind the hips (law of cosines)."""
+    # The leg's plane turns about the abduction joint, at a distance from it.
+    square = base[:, 1] ** 2 + base[:, 2] ** 2 - offset**2
+    length = np.sqrt(np.maximum(square, 0.0))
+    cosine = (square - thigh**2 - shank**2) / (2 * thigh * shank)
     if np.any(np.abs(cosine) > 1):
+        reach = (thigh + shank).min()
         raise ValueError(
-            f"foot_height={height} is out of the leg's reach; choose one in (-{(thigh + shank).min()}, 0)"
+            f"foot_height={base[0, 2]} and foot_spread={abs(base[0, 1]) - abs(offset[0]):g} are out of the leg's "
+            f"reach; choose feet nearer to the hip joints than {reach:g}"
         )
+    abduction = np.arctan2(base[:, 1], -base[:, 2]) - np.arctan2(offset, length)
     knee = np.arccos(cosine)
     hip = -np.arctan2(shank * np.sin(knee), thigh + shank * np.cos(knee))
-    # These are turns about -y.
-    pose = np.stack([np.zeros_like(hip), -signs[:, 1] * hip, -signs[:, 2] * knee], axis=1)
+    # The first is a turn about x, the others about -y.
+    pose = np.stack([signs[:, 0] * abduction, -signs[:, 1] * hip, -signs[:, 2] * knee], axis=1)
     return pose.reshape(-1)
 
 

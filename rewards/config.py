@@ -33,6 +33,8 @@ class RewardConfig:
     alone leaves a slow drift, which adds up to radians over 5 m."""
     tilt: float = 0.2
     """Weight of the squared roll and pitch rates (s²/rad²), scaled by 0.1; not in the paper."""
+    heave: float = 0.0
+    """Weight of the trunk's squared vertical velocity (s²/m²); not in the paper. 0 leaves the term away."""
     knee: float = 0.0
     """Weight of knees that come near the terrain (mean over the legs), -1 where one hits it; not in the paper. 0 leaves
     the term away. On high stairs most falls are knees that hit the edge of the next step."""

@@ -10,8 +10,8 @@ def total(config: RewardConfig, terms: dict[str, jax.Array]) -> tuple[jax.Array,
 
     Args:
       config: weights.
-      terms: `along`, `across`, `smooth`, `energy`, `terrain`, `aim`, `height`, `yaw`, `heading`, `tilt`, and `knee`
-        if it is paid for, each () and unweighted.
+      terms: `along`, `across`, `smooth`, `energy`, `terrain`, `aim`, `height`, `yaw`, `heading`, `tilt`, and `heave`
+        and `knee` if they are paid for, each () and unweighted.
 
     Returns:
       The reward (), and each term as it enters it.

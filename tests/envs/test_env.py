@@ -182,6 +182,20 @@ def test_some_are_told_once_to_stand_for_a_while(exact):
     assert not np.asarray(jax.vmap(env._draw_stop)(jax.random.split(jax.random.key(0), 100))).any()
 
 
+def test_some_are_told_to_walk_straight_ahead_or_back(exact):
+    other = object.__new__(type(exact.env))
+    other.__dict__.update(
+        exact.env.__dict__ | {"config": dataclasses.replace(exact.config, straight_share=0.4)}
+    )
+    keys = jax.random.split(jax.random.key(0), 4000)
+    angles = np.asarray(
+        jax.vmap(lambda key: other._draw_straight(key, jnp.float32(0.5), jnp.float32(2)))(keys)
+    )
+    ahead, back = (np.isclose(angles, 0.5 + turn, atol=1e-6) for turn in (0.0, np.pi))
+    assert ahead.mean() == pytest.approx(0.2, abs=0.03) and back.mean() == pytest.approx(0.2, abs=0.03)
+    assert np.all(angles[~ahead & ~back] == 2)
+
+
 def test_told_to_stand_it_is_seen_and_rewarded(exact):
     state = change(exact.state, command=LEFT, stop=np.array([3, 6]), qpos=standing(exact.env))
     shown, paid = [], []
@@ -347,6 +361,17 @@ def test_knee_term_looks_at_the_knees_clearance(exact):
         assert terms["knee"] == pytest.approx(-found[-1], abs=0.02)  # heights are whole millimetres
         assert rewards.total(c, terms)[1]["knee"] == pytest.approx(2.0 * terms["knee"])
     assert np.std(found) > 0.1
+
+
+def test_heave_term_is_the_vertical_speed_squared(exact):
+    c = dataclasses.replace(exact.config.rewards, heave=2.0)
+    paid = with_config(exact, dataclasses.replace(exact.config, rewards=c))
+    assert set(paid.metric_names) - set(exact.env.metric_names) == {"reward/heave"}
+    episode = episode_at(exact, exact.find("stairs", 9), standing(exact.env))
+    moving = change_episode(episode, qvel=np.concatenate([[0.3, -0.2, -0.25], np.ones(15)]))
+    terms = paid._reward_terms(episode, moving, *paid._terrain_at_feet(moving))
+    assert terms["heave"] == pytest.approx(-0.0625)
+    assert rewards.total(c, terms)[1]["heave"] == pytest.approx(-0.125)
 
 
 def with_config(subject, changed):

@@ -159,6 +159,20 @@ def test_default_pose_puts_the_feet_under_the_hips(config):
     assert np.all(robot.default_pose > robot.joint_lower) and np.all(robot.default_pose < robot.joint_upper)
 
 
+@pytest.mark.parametrize("spread", [-0.03, 0.06])
+def test_feet_stand_outside_the_hips_by_their_spread(config, spread):
+    config = dataclasses.replace(config, foot_spread=spread)
+    model, robot = robot_spec(config).compile(), make_robot(config)
+    data = mujoco.MjData(model)
+    data.qpos[:] = robot.standing_qpos
+    mujoco.mj_forward(model, data)
+    feet, hips = data.site_xpos[robot.foot_site_ids], robot.hip_position[:, :2].copy()
+    hips[:, 1] += robot.hip_offset + np.sign(robot.hip_offset) * spread
+    np.testing.assert_allclose(feet[:, :2], hips, atol=1e-9)
+    np.testing.assert_allclose(feet[:, 2], robot.foot_radius, atol=1e-9)
+    assert np.all(data.xpos[robot.knee_ids][:, 0] < feet[:, 0] - 0.1)
+
+
 @settings(max_examples=20, deadline=None)
 @given(st.sampled_from(sorted(ROBOTS)), st.lists(st.floats(-1, 1), min_size=12, max_size=12))
 def test_mirrored_legs_have_the_mirrored_mass_matrix(name, angles):
@@ -241,6 +255,8 @@ def test_unknown_robot_names_the_choices():
 def test_stance_out_of_reach_is_refused():
     with pytest.raises(ValueError, match="out of the leg's reach"):
         make_robot(RobotConfig(foot_height=-0.5))
+    with pytest.raises(ValueError, match="foot_spread=0.2 are out of the leg's reach"):
+        make_robot(RobotConfig(foot_height=-0.43, foot_spread=0.2))
 
 
 # A robot from a file ----------------------------------------------------------------------------------------

@@ -153,6 +153,7 @@ WEIGHTS = {
     "yaw": 0.1,
     "heading": 0.3,
     "tilt": 0.2,
+    "heave": 0.5,
     "knee": 2.0,
 }
 TERMS = {
@@ -166,6 +167,7 @@ TERMS = {
     "yaw": -0.3,
     "heading": -0.1,
     "tilt": -0.05,
+    "heave": -0.04,
     "knee": -0.03,
 }
 
@@ -188,11 +190,12 @@ def test_total_by_hand():
         "yaw": -0.03,
         "heading": -0.03,
         "tilt": -0.01,
+        "heave": -0.02,
         "knee": -0.06,
     }
     assert {name: float(value) for name, value in weighted.items()} == pytest.approx(expected, abs=1e-6)
-    # 0.5 + 0.2 + 0.075 - 0.1 - 0.1 - 0.05 - 0.04 - 0.03 - 0.03 - 0.01 - 0.06
-    assert reward == pytest.approx(0.355, abs=1e-6)
+    # 0.5 + 0.2 + 0.075 - 0.1 - 0.1 - 0.05 - 0.04 - 0.03 - 0.03 - 0.01 - 0.02 - 0.06
+    assert reward == pytest.approx(0.335, abs=1e-6)
 
 
 def test_literal_total_adds_the_gentle_terms_as_they_are():
