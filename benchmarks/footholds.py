@@ -62,6 +62,7 @@ class Options:
     touch_down: float = cli.option(
         -1.0, "share of the trunk's motion that swing leaves out; negative: the policy's"
     )
+    lead: float = cli.option(-1.0, "time by which feet are ahead on their way (s); negative: the policy's")
     robots: int = cli.option(96, "episodes, two on each terrain")
     seconds: float = cli.option(8.0, "longest episode")
     json: str = cli.option("", "file for the result")
@@ -77,6 +78,7 @@ def make_env(policy: Policy, options: Options) -> envs.QuadrupedEnv:
         "tg.swing_share": options.swing_share or own.tg.swing_share,
         "tg.step_length": options.step_length or own.tg.step_length,
         "tg.touch_down": options.touch_down if options.touch_down >= 0 else own.tg.touch_down,
+        "tg.lead": options.lead if options.lead >= 0 else own.tg.lead,
     }
     config = settings.changed(
         own,

@@ -9,6 +9,7 @@ BEFORE = {
     "look_ahead_from": 0.0,
     "follow": False,
     "sample_radius": 0.1,
+    "lead": 0.0,
     "touch_down": 0.0,
     "swing_share": 0.5,
     "gait": "trot",
@@ -76,6 +77,9 @@ class TGConfig:
     sample_radius: float = 0.1
     """Radius of the outer circle of height samples (m). In the middle of a gap twice as wide all samples are low, and
     say nothing of where the ground is."""
+    lead: float = 0.0
+    """Time (s) by which feet are ahead on their way along the step, to make up for joints that follow late, at
+    `base_frequency`. Their height isn't ahead: feet that come down early are nearer to where they were led."""
     touch_down: float = 0.0
     """Share of the trunk's rise, fall and tilt that is taken out of the height of feet in swing: 1 leads them to the
     height of the feet in stance, so that they come down when the step ends, whatever the trunk does; 0, as in the

@@ -411,7 +411,8 @@ class Core:
         """
         xp = phases.__array_namespace__()
         c = self.config
-        along = path.stride(phases, c.retraction, c.swing_share)[:, None] * (c.step_length * stride)
+        early = path.wrap(phases + 2.0 * math.pi * c.base_frequency * c.lead) if c.lead else phases
+        along = path.stride(early, c.retraction, c.swing_share)[:, None] * (c.step_length * stride)
         up = lift * path.height(phases)
         if level is None:
             level = frames.heading_from_trunk(frames.up_in_trunk(sensors.orientation))

@@ -212,6 +212,24 @@ def test_levelling_scales_how_much_of_the_tilt_is_taken_out(subject):
     np.testing.assert_allclose(targets[0.5], (targets[0.0] + targets[1.0]) / 2)
 
 
+def test_a_lead_takes_feet_ahead_on_their_way_and_not_in_their_height(subject):
+    core, plain = (subject.make(np.float64, lead=lead) for lead in (0.03, 0.0))
+    early, lift, sensors = (
+        2 * np.pi * core.config.base_frequency * 0.03,
+        np.full(4, 0.08),
+        level_sensors(core),
+    )
+    for phase in (0.4, 1.9, 3.1, -0.2, -2.0):
+        now, then = (tg.path.leg_phases(np.asarray(p)) for p in (phase, phase + early))
+        targets = core.foot_targets(now, lift, LEFT, sensors)
+        np.testing.assert_allclose(
+            targets[:, :2], plain.foot_targets(then, lift, LEFT, sensors)[:, :2], atol=1e-9
+        )
+        np.testing.assert_allclose(
+            targets[:, 2], plain.foot_targets(now, lift, LEFT, sensors)[:, 2], atol=1e-9
+        )
+
+
 @pytest.mark.parametrize("tilt", [0.0, 0.1])
 def test_feet_come_down_where_the_feet_in_stance_are_whatever_the_trunk_does(subject, tilt):
     """A trunk 2 cm too low, and tilted: at the end of the step LF and RR are led to the height of the other feet."""
