@@ -60,6 +60,7 @@ LIMITS: dict[str, tuple[float, float]] = {
     "ppo.reward_scaling": (1e-6, 1e6),
     "ppo.guide": (0.0, 1e3),
     "ppo.guide_rate": (0.0, 1.0),
+    "ppo.critic_rate": (0.0, 1.0),
     "ppo.guide_epochs": (1, 1000),
     "ppo.average": (0.0, 0.99999),
     "ppo.taken_over": (0.0, 1e3),

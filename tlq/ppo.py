@@ -58,6 +58,10 @@ class PPOConfig:
     """Lower bound of the adaptive learning rate."""
     learning_rate_max: float = 1e-3
     """Upper bound of the adaptive learning rate."""
+    critic_rate: float = 0.0
+    """Adam's learning rate of the critic; 0: the policy's. The KL target bounds how fast the policy may change, which
+    says nothing of the critic: at so low a rate it lags behind, most of all one that begins anew (`init=` with a
+    policy file). If set, the gradients of the two are scaled down each by its own norm."""
     kl_target: float = 0.015
     """KL(old, new) of an iteration that the learning rate is steered to; 0 keeps the learning rate."""
     kl_stop: float = 4.0
@@ -177,9 +181,8 @@ class Learner:
         # In PPO's own loss the guide has a say at every step.
         strides = [s for s in range(1, STRIDE + 1) if config.unroll % s == 0]
         self.stride = 1 if networks.footholds is None else strides[-1]
-        self._optimiser = optax.chain(
-            optax.clip_by_global_norm(config.max_grad_norm), optax.scale_by_adam(eps=1e-5)
-        )
+        self._clip = optax.clip_by_global_norm(config.max_grad_norm)
+        self._optimiser = optax.chain(optax.identity(), optax.scale_by_adam(eps=1e-5))
         self._loss = functools.partial(ppo_loss, networks=networks, config=config, axis=AXIS)
         self._foothold_loss = functools.partial(foothold_loss, networks=networks)
         split = {"env_state": P(AXIS)}  # and nothing else
@@ -389,10 +392,28 @@ class Learner:
         orders = jax.vmap(order)(jnp.arange(here)).reshape(here, passes, minibatches, -1)
         return jnp.moveaxis(orders, 0, 2).reshape(passes * minibatches, -1)
 
+    def _clipped(self, grads: Any) -> Any:
+        """A gradient, scaled down to `max_grad_norm`."""
+        return self._clip.update(grads, optax.EmptyState())[0]
+
     def _descend(self, params: Any, opt_state: Any, grads: Any, rate: jax.Array | float) -> tuple[Any, Any]:
         """Parameters and optimiser's state after a gradient step."""
-        updates, opt_state = self._optimiser.update(grads, opt_state)
+        updates, opt_state = self._optimiser.update(self._clipped(grads), opt_state)
         return optax.apply_updates(params, jax.tree.map(lambda u: -rate * u, updates)), opt_state
+
+    def _improve(
+        self, params: PPONetworkParams, opt_state: Any, grads: PPONetworkParams, rate: jax.Array
+    ) -> tuple[PPONetworkParams, Any]:
+        """The same of policy and critic, which may have a rate of its own."""
+        if not self.config.critic_rate:
+            return self._descend(params, opt_state, grads, rate)
+        clipped = PPONetworkParams(policy=self._clipped(grads.policy), value=self._clipped(grads.value))
+        updates, opt_state = self._optimiser.update(clipped, opt_state)
+        updates = PPONetworkParams(
+            policy=jax.tree.map(lambda u: -rate * u, updates.policy),
+            value=jax.tree.map(lambda u: -self.config.critic_rate * u, updates.value),
+        )
+        return optax.apply_updates(params, updates), opt_state
 
     def _update(
         self, state: TrainState, carry: jax.Array, rollout: Rollout, last: jax.Array, key: jax.Array
@@ -414,7 +435,7 @@ class Learner:
                 params, state.normaliser, batch, carry[index], last[index], _keys(key, numbers[index])
             )
             grads, losses = jax.lax.pmean((grads, losses), AXIS)
-            stepped = self._descend(params, opt_state, grads, state.learning_rate)
+            stepped = self._improve(params, opt_state, grads, state.learning_rate)
             figures = dict(losses, grad_norm=optax.global_norm(grads))
             if c.kl_target > 0 and c.kl_stop > 0:
                 # A step too far is seen by the next minibatch. A policy with little spread needs few to be lost.

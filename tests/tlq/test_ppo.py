@@ -319,6 +319,30 @@ def test_the_guide_teaches_the_footholds_and_reward_the_rest():
 
 
 @pytest.mark.slow
+def test_the_critic_may_learn_at_a_rate_of_its_own():
+    """Adam's first step is as long as the rate, in every parameter: of the policy one, of the critic the other."""
+
+    def changed(**rates):
+        learner = make_learner(
+            config=dataclasses.replace(CONFIG, minibatches=1, epochs=1, kl_target=0.0, **rates)
+        )
+        before, _ = learner.step(learner.init(0))  # which only measures
+        after, _ = learner.step(before)
+        return [
+            max(float(jnp.abs(a - b).max()) for a, b in zip(*map(jax.tree.leaves, (new, old)), strict=True))
+            for new, old in (
+                (after.params.policy, before.params.policy),
+                (after.params.value, before.params.value),
+            )
+        ]
+
+    assert changed(learning_rate=1e-3) == pytest.approx([1e-3, 1e-3], rel=0.05)
+    assert changed(learning_rate=1e-3, critic_rate=5e-3) == pytest.approx([1e-3, 5e-3], rel=0.05)
+    policy, critic = changed(learning_rate=0.0, critic_rate=5e-3)
+    assert policy == 0 and critic == pytest.approx(5e-3, rel=0.05)
+
+
+@pytest.mark.slow
 def test_residuals_that_footholds_take_over_cost_their_squares():
     """The loss with the weight less that without: the squares of the rest's residuals times the shares, by hand."""
     learner = make_learner(env=Asking(ToyEnv(length=5)), foothold_head=16)
