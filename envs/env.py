@@ -256,7 +256,8 @@ class QuadrupedEnv(Env):
         """`step` without the observation."""
         before: Episode = state.pipeline_state
         sensors, command = self.sense(before), self.heading_command(before)
-        controller, desired = self.core.act(before.controller, action, sensors, command)
+        patch = self._patch(before, sensors) if self.core.config.refine else None
+        controller, desired = self.core.act(before.controller, action, sensors, command, patch)
         after = self._simulate(before, desired)
         after = after.replace(controller=controller, step=before.step + 1)
         below, around = self._terrain_at_feet(after)
@@ -359,7 +360,7 @@ class QuadrupedEnv(Env):
     def observe(self, episode: Episode) -> dict[str, jax.Array]:
         """The observations of policy and critic."""
         sensors, command = self.sense(episode), self.heading_command(episode)
-        points = self.core.sample_points(episode.controller, sensors)
+        points = self.core.around(self.core.centres(episode.controller, sensors))
         true = seen = self._heights(episode, points)
         if self.config.randomisation.enabled and self.core.heights:
             offset = episode.randomised.map_offset
@@ -368,6 +369,16 @@ class QuadrupedEnv(Env):
             seen = seen + self.config.randomisation.height_noise * noise
         state = self.core.observe(episode.controller, sensors, seen if self.core.heights else None, command)
         return {"state": state, "privileged_state": self._privileged(episode, state, true, command)}
+
+    def _patch(self, episode: Episode, sensors: tg.Sensors) -> jax.Array:
+        """Heights (L, N) m of the patches of `tg.footholds` as the robot perceives them.
+
+        Drifted like the samples. The noise of single heights is left out: what counts is which are in a gap.
+        """
+        points = self.core.patch(self.core.centres(episode.controller, sensors))
+        if self.config.randomisation.enabled:
+            points = points + episode.randomised.map_offset[:2]
+        return self._heights(episode, points)
 
     def _heights(self, episode: Episode, points: jax.Array) -> jax.Array:
         """Terrain heights (...) m from the trunk's centre, at points (..., 2) m of the heading frame."""
@@ -635,6 +646,11 @@ def check(config: EnvConfig) -> None:
         raise ValueError(
             f"control_dt={config.control_dt} must be a whole multiple of physics_dt={config.physics_dt}"
         )
+    if config.tg.refine:
+        if config.method == "blind":
+            raise ValueError(f"tg.refine={config.tg.refine} needs heights; set it to 0 with method=blind")
+        if config.tg.follow or not config.tg.look_ahead:
+            raise ValueError(f"tg.refine={config.tg.refine} needs tg.look_ahead=true and tg.follow=false")
     if config.knee_contact and config.knee_radius == 0:
         raise ValueError("knee_radius=0 must be above 0 with knee_contact=true")
     if len(config.curriculum.difficulty) != len(config.curriculum.depth) or not config.curriculum.depth:

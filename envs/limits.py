@@ -69,6 +69,7 @@ LIMITS: dict[str, tuple[float, float]] = {
     "tg.levelling": _SHARE,
     "tg.weight_compensation": (0.0, 2.0),
     "tg.lead": (0.0, 0.1),
+    "tg.refine": (0.0, 0.05),
     "tg.look_ahead_from": (-math.pi, 0.0),
     "tg.touch_down": _SHARE,
     "tg.start_time": (1e-3, 10.0),

@@ -1,6 +1,6 @@
 """The controller core: trajectory generator, leg kinematics, observation. Runs under JAX and under NumPy alike."""
 
-from tg import frames, leg, path, samples
+from tg import footholds, frames, leg, path, samples
 from tg.config import BEFORE, TGConfig
 from tg.core import ACTION_SIZE, ControllerState, Core, Sensors
 from tg.leg import LegGeometry
@@ -13,6 +13,7 @@ __all__ = [
     "LegGeometry",
     "Sensors",
     "TGConfig",
+    "footholds",
     "frames",
     "leg",
     "path",

@@ -2,7 +2,7 @@
 
 Everything the policy sees and does passes through `Core`, written against the array API, so that the same lines run
 under JAX in training and under NumPy on the robot. Letters: L = 4 legs (LF, RF, LR, RR), J = 12 joints (leg by leg:
-abduction, hip, knee), P = 25 sample points a foot, S = size of the observation.
+abduction, hip, knee), P = 25 sample points a foot (146 with `TGConfig.refine`), S = size of the observation.
 """
 
 import dataclasses
@@ -10,7 +10,7 @@ import functools
 import math
 from typing import Any, NamedTuple
 
-from tg import frames, leg, path, samples
+from tg import footholds, frames, leg, path, samples
 from tg.arrays import stack
 from tg.config import TGConfig
 
@@ -133,6 +133,11 @@ class Core:
         return layout(self.heights)
 
     @property
+    def points(self) -> int:
+        """P: how many heights are wanted round each foot, the policy's 25 and, with `TGConfig.refine`, the patch's."""
+        return samples.COUNT + (footholds.COUNT if self.config.refine else 0)
+
+    @property
     def observation_size(self) -> int:
         """S."""
         return sum(size for _, size in self.layout)
@@ -181,8 +186,8 @@ class Core:
         return in_trunk @ frames.heading_from_trunk(frames.up_in_trunk(sensors.orientation)).T
 
     def sample_points(self, state: ControllerState, sensors: Sensors) -> Array:
-        """Points (4, 25, 2) m at which the terrain's height is wanted, from the trunk's centre, heading frame."""
-        return self.around(self.centres(state, sensors))
+        """Points (4, P, 2) m at which the terrain's height is wanted, from the trunk's centre, heading frame."""
+        return self.wanted(self.centres(state, sensors))
 
     def centres(self, state: ControllerState, sensors: Sensors) -> Array:
         """Centres (4, 2) m of the circles of `sample_points`: the feet, or where steps end (`TGConfig.look_ahead`)."""
@@ -201,6 +206,18 @@ class Core:
     def around(self, centres: Array) -> Array:
         """The points (4, 25, 2) m of the circles round places (4, 2 or 3) m."""
         return centres[:, None, :2] + self._ring_offsets
+
+    def patch(self, centres: Array) -> Array:
+        """The points (4, N, 2) m of the patches of `tg.footholds` round places (4, 2) m."""
+        return centres[:, None] + self._patch_offsets
+
+    def wanted(self, centres: Array) -> Array:
+        """Points (4, P, 2) m at which heights are wanted if centres (4, 2) m are the circles'."""
+        circles = self.around(centres)
+        if not self.config.refine:
+            return circles
+        xp = centres.__array_namespace__()
+        return xp.concatenate([circles, self.patch(centres)], axis=1)
 
     def odometry(self, state: ControllerState, sensors: Sensors, level: Array | None = None) -> Array:
         """The trunk's velocity (2,) m/s in the heading frame, by the legs in stance, smoothed over a few steps.
@@ -270,7 +287,8 @@ class Core:
         Args:
           state: of the controller.
           sensors: of the robot.
-          heights: (4, 25) m, the terrain's at `sample_points`, from the trunk's centre, up positive; None if blind.
+          heights: (4, 25) m, the terrain's at the first 25 of `sample_points`, from the trunk's centre, up positive;
+            None if blind.
           command: (2,) direction in the heading frame, a unit vector, or 0 to stand.
 
         Returns:
@@ -299,7 +317,12 @@ class Core:
         return xp.where(mirror > 0, observation, observation[index] * sign)
 
     def act(
-        self, state: ControllerState, action: Array, sensors: Sensors, command: Array
+        self,
+        state: ControllerState,
+        action: Array,
+        sensors: Sensors,
+        command: Array,
+        patch: Array | None = None,
     ) -> tuple[ControllerState, Array]:
         """One control step: the policy's action to desired joint angles.
 
@@ -308,6 +331,8 @@ class Core:
           action: (14,) in [-1, 1], as the policy gave it (mirrored if its observation was).
           sensors: those of the observation.
           command: that of the observation.
+          patch: (4, N) m, the terrain's heights at `patch` round the observation's centres; needed with
+            `TGConfig.refine`.
 
         Returns:
           The next state, and the desired joint angles (12,) rad.
@@ -350,6 +375,11 @@ class Core:
         targets = self.foot_targets(phases, lift * gate, stride, sensors, level, gate)
         tg_angles = leg.inverse(self.geometry, targets)
         residual = c.residual_range * xp.reshape(action[2:], (4, 3))
+        if c.refine:
+            assert patch is not None
+            residual = self._refined(
+                residual, tg_angles, targets, level, gate * footholds.share(phases), patch
+            )
         wanted = tg_angles + residual
         reached = leg.forward(self.geometry, wanted)
         sag = leg.support_torque(
@@ -372,6 +402,38 @@ class Core:
             velocity=velocity,
         )
         return state, desired
+
+    def _refined(
+        self, residual: Array, tg_angles: Array, targets: Array, level: Array, share: Array, patch: Array
+    ) -> Array:
+        """Residual joint angles (4, 3) rad that lead the feet a little off the gaps near where they are led.
+
+        Args:
+          residual: (4, 3) rad, the policy's.
+          tg_angles, targets: (4, 3) rad and m, the trajectory generator's.
+          level: (3, 3) `heading_from_trunk`.
+          share: (4,) which part of the shift counts.
+          patch: (4, N) m.
+        """
+        xp, bound = residual.__array_namespace__(), self.config.residual_range
+        led = ((leg.forward(self.geometry, tg_angles + residual) - targets) @ level.T)[:, :2]
+        moved = share[:, None] * footholds.shift(led, patch, self.config.refine)
+        columns, small = [], 0.01  # rad; long enough for single precision
+        for joint in range(3):
+            unit = self._constant([small * (i == joint) for i in range(3)])
+            ahead, behind = (
+                leg.forward(self.geometry, tg_angles + residual + side * unit) for side in (1.0, -1.0)
+            )
+            columns.append((((ahead - behind) / (2.0 * small)) @ level.T)[:, :2])
+        slope = xp.stack(columns, axis=-1)  # (4, 2, 3) m/rad
+        # The smallest change of the three angles that moves the foot so, in the plane.
+        a, b = slope[:, 0], slope[:, 1]
+        aa, bb, ab = (xp.sum(x * y, axis=-1) for x, y in ((a, a), (b, b), (a, b)))
+        aa, bb = aa + 1e-6, bb + 1e-6
+        p, q = moved[:, 0], moved[:, 1]
+        scale = aa * bb - ab * ab
+        u, v = (bb * p - ab * q) / scale, (aa * q - ab * p) / scale
+        return xp.clip(residual + u[:, None] * a + v[:, None] * b, -bound, bound)
 
     def stepping(self, state: ControllerState, command: Array) -> Array:
         """Whether feet that are in swing by their phase move, () bool: with a command, and to the end of the last step.
@@ -461,6 +523,10 @@ class Core:
     @functools.cached_property
     def _ring_offsets(self) -> Array:
         return self._constant(samples.ring_offsets(self.config.sample_radius))
+
+    @functools.cached_property
+    def _patch_offsets(self) -> Array:
+        return self._constant(footholds.offsets().tolist())
 
     @functools.cached_property
     def _swings(self) -> Array:

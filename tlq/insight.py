@@ -13,8 +13,9 @@ from tlq.simulation import Simulation
 
 def sample_points(sim: Simulation) -> np.ndarray:
     """The terrain's points (L, P, 3) m that the policy sees, as high as it sees them."""
-    flat = sim.data.qpos[:2] + tg.frames.turn(np.asarray(sim.yaw), sim.points)
-    return np.concatenate([flat, sim.data.qpos[2] + sim.heights[..., None]], axis=-1)
+    points, heights = sim.points[:, : tg.samples.COUNT], sim.heights[:, : tg.samples.COUNT, None]
+    flat = sim.data.qpos[:2] + tg.frames.turn(np.asarray(sim.yaw), points)
+    return np.concatenate([flat, sim.data.qpos[2] + heights], axis=-1)
 
 
 def measured_cells(sim: Simulation, reach: float) -> np.ndarray:

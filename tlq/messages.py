@@ -14,10 +14,12 @@ from typing import ClassVar
 
 import numpy as np
 
+import tg
+
 MAGIC = b"TLQM"
 VERSION = 2
-LARGEST = 2048
-"""Bytes to read at most; every message is shorter, and stays one Ethernet packet."""
+LARGEST = 4096
+"""Bytes to read at most; every message is shorter, and without a patch of heights it stays one Ethernet packet."""
 
 _HEAD = struct.Struct("<4sBBHQQ")
 _CHECK = struct.Struct("<I")
@@ -39,9 +41,10 @@ class Sensing:
         "joint_position": (12,),
         "joint_velocity": (12,),
         "command": (2,),
-        "heights": (4, 25),
+        "heights": (4, tg.samples.COUNT),
     }
-    """Body: these arrays, in this order, each number a float32."""
+    """Body: these arrays, in this order, each number a float32. Heights may be (4, `MOST`)."""
+    MOST: ClassVar[int] = tg.samples.COUNT + tg.footholds.COUNT
 
     sequence: int
     """Counts the sender's messages."""
@@ -58,15 +61,16 @@ class Sensing:
     command: np.ndarray
     """(2,) unit vector in the heading frame, or 0 to stand."""
     heights: np.ndarray
-    """(4, 25) m, as `Controller.step` takes them, at the points round the last `Targets.centres`; a blind policy
-    doesn't look at them."""
+    """(4, P) m, as `Controller.step` takes them, at points round the last `Targets.centres` (`tg.Core.wanted`); P is
+    25, or 146 for a policy with `tg.refine`. A blind policy doesn't look at them."""
 
     def pack(self) -> bytes:
         """The message's bytes; raises ValueError where an array has another shape."""
         parts = []
         for name, shape in self.FIELDS.items():
             array = np.asarray(getattr(self, name), "<f4")
-            if array.shape != shape:
+            patched = name == "heights" and array.shape == (4, self.MOST)
+            if array.shape != shape and not patched:
                 raise ValueError(f"{name} has shape {array.shape}; expected {shape}")
             parts.append(array.tobytes())
         return _frame(self.KIND, self.sequence, self.time, b"".join(parts))
@@ -112,7 +116,8 @@ class Targets:
 
 
 _NUMBERS = sum(int(np.prod(shape)) for shape in Sensing.FIELDS.values())
-_BODY = {Sensing.KIND: 4 * _NUMBERS, Targets.KIND: _ANSWER.size + 4 * (12 + 8)}
+_PATCHED = _NUMBERS + 4 * tg.footholds.COUNT
+_BODY = {Sensing.KIND: (4 * _NUMBERS, 4 * _PATCHED), Targets.KIND: (_ANSWER.size + 4 * (12 + 8),)}
 
 
 def unpack(data: bytes) -> Sensing | Targets:
@@ -124,7 +129,7 @@ def unpack(data: bytes) -> Sensing | Targets:
         raise MessageError("not a message of this program")
     if version != VERSION:
         raise MessageError(f"message version {version}; this program reads version {VERSION}")
-    if _BODY.get(kind) != size or len(data) != _HEAD.size + size + _CHECK.size:
+    if size not in _BODY.get(kind, ()) or len(data) != _HEAD.size + size + _CHECK.size:
         raise MessageError(f"kind {kind} with {size} bytes, in {len(data)}, isn't a message")
     if _CHECK.unpack_from(data, len(data) - _CHECK.size)[0] != zlib.crc32(data[: -_CHECK.size]):
         raise MessageError("the checksum is wrong")
@@ -144,6 +149,8 @@ def _frame(kind: int, sequence: int, time: int, body: bytes) -> bytes:
 def _arrays(body: bytes) -> dict[str, np.ndarray]:
     values, start, found = np.frombuffer(body, "<f4").astype(np.float32), 0, {}
     for name, shape in Sensing.FIELDS.items():
+        if name == "heights":  # the last, and all that is left
+            shape = (4, (len(values) - start) // 4)
         size = int(np.prod(shape))
         found[name] = values[start : start + size].reshape(shape)
         start += size

@@ -28,10 +28,10 @@ VERSION = 1
 LARGEST = 1 << 28
 """Bytes a policy file may unpack to."""
 
+
 Sensors = Mapping[str, np.ndarray]
 
 _SHAPES = {"orientation": (4,), "angular_velocity": (3,), "joint_position": (12,), "joint_velocity": (12,)}
-_HEIGHTS = (4, 25)
 _START_PHASE = 0.5 * math.pi
 """Every foot is in the middle of its step there: fading in the stride pushes the robot neither way."""
 
@@ -128,13 +128,15 @@ class Controller:
         length = math.hypot(*direction.tolist())
         if length > 1e-6 and abs(length - 1.0) > 0.01:
             raise ValueError(f"command has length {length:.3g}; give a unit vector, or 0, 0 to stand")
+        shape = (4, self.core.points)
         if self.core.heights:
             if heights is None:
-                raise ValueError(f"heights is None; this policy needs an array of shape {_HEIGHTS}")
-            heights = _array("heights", heights, _HEIGHTS)
-        self.observation = self.core.observe(self.state, measured, heights, direction)
+                raise ValueError(f"heights is None; this policy needs an array of shape {shape}")
+            heights = _array("heights", heights, shape)
+        seen, patch = (None, None) if heights is None else np.split(heights, [tg.samples.COUNT], axis=1)
+        self.observation = self.core.observe(self.state, measured, seen, direction)
         self.action, self.memory = self._graph(self.observation, self.memory)
-        self.state, desired = self.core.act(self.state, self.action, measured, direction)
+        self.state, desired = self.core.act(self.state, self.action, measured, direction, patch)
         return desired
 
 

@@ -153,10 +153,10 @@ class Simulation:
         self.sensors, offset, error = exact._asdict(), np.zeros(3), np.zeros(())
         if self.noise is not None:
             self.sensors, offset = noisy(self.sensors, self.noise, self._random), self._offset
-            error = self.noise.height_noise * self._random.standard_normal(self._ground.shape)
+            error = self.noise.height_noise * self._random.standard_normal((4, core.points))
         self.points = self.controller.sample_points(self.sensors)
         if centres is not None:
-            self.points = core.around(np.where(np.isfinite(centres), centres, self._feet[:, :2]))
+            self.points = core.wanted(np.where(np.isfinite(centres), centres, self._feet[:, :2]))
         if self.perception is not None:
             self.perception.look(data)
             self.heights = self.perception.heights(data, self.points)

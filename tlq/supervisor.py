@@ -154,6 +154,8 @@ class Supervisor:
         length = math.hypot(*message.command.tolist())
         if not (length <= 1e-6 or abs(length - 1.0) <= 0.01):
             return "command"
+        if core.heights and message.heights.shape != (4, core.points):
+            return "heights"
         if core.heights and not np.abs(message.heights).max() <= c.max_height:
             return "heights"
         return ""

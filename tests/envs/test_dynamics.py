@@ -179,6 +179,20 @@ def test_unknown_dynamics():
         check(EnvConfig(dynamics="three"))
 
 
+@pytest.mark.parametrize(
+    ("method", "settings", "message"),
+    [
+        ("blind", {"follow": False}, "tg.refine=0.015 needs heights; set it to 0 with method=blind"),
+        ("ours", {}, "tg.refine=0.015 needs tg.look_ahead=true and tg.follow=false"),
+        ("ours", {"look_ahead": False, "follow": False}, "tg.refine=0.015 needs tg.look_ahead=true"),
+    ],
+)
+def test_refining_needs_heights_round_the_ends_of_steps(method, settings, message):
+    check(EnvConfig(tg=tg.TGConfig(refine=0.015, follow=False)))
+    with pytest.raises(ValueError, match=message):
+        check(EnvConfig(method=method, tg=tg.TGConfig(refine=0.015, **settings)))
+
+
 def test_gaits_that_cannot_be():
     for gait, share, message in [
         ("pace", 0.5, "unknown gait 'pace'; choose one of trot, walk"),

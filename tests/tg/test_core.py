@@ -230,6 +230,47 @@ def test_a_lead_takes_feet_ahead_on_their_way_and_not_in_their_height(subject):
         )
 
 
+def test_a_patch_shifts_feet_in_swing_where_it_should_and_no_others(subject):
+    """Where the two desired poses put the feet, by forward kinematics, with and without the patch."""
+    core, plain = (
+        subject.make(np.float64, refine=reach, follow=False, weight_compensation=0.0)
+        for reach in (0.015, 0.0)
+    )
+    sensors = level_sensors(core)
+    level = tg.frames.heading_from_trunk(tg.frames.up_in_trunk(sensors.orientation))
+    rng = np.random.default_rng(0)
+    patch = np.where(rng.random((4, tg.footholds.COUNT)) < 0.4, -0.9, -0.3)
+    most_moved = 0.0
+    for state, *_ in walk(plain, 40)[20:]:
+        action = rng.uniform(-0.4, 0.4, 14)
+        after, desired = core.act(state, action, sensors, LEFT, patch)
+        before, _ = plain.act(state, action, sensors, LEFT)
+        led = plain.residual_displacement(before, sensors)[:, :2]
+        share = after.gate * tg.footholds.share(core.phases(after.phase))
+        expected = share[:, None] * tg.footholds.shift(led, patch, 0.015)
+        moved = (after.targets[0] - before.targets[0]).reshape(4, 3) @ level.T
+        np.testing.assert_allclose(moved[:, :2], expected, atol=1.5e-3)
+        most_moved = max(most_moved, np.abs(expected).max())
+        assert (moved[core.phases(after.phase) <= 0] == 0).all()
+        np.testing.assert_array_equal(after.actions, before.actions)
+        # No residual angle goes beyond its range.
+        most = np.concatenate([action[:2], np.ones(12)])
+        none = np.concatenate([action[:2], np.zeros(12)])
+        change = core.act(state, most, sensors, LEFT, patch)[1] - plain.act(state, none, sensors, LEFT)[1]
+        assert np.abs(change).max() <= core.config.residual_range + 1e-9
+    assert most_moved > 0.005
+
+
+def test_a_patch_is_wanted_round_the_same_places(subject):
+    core, plain = (subject.make(np.float64, refine=reach, follow=False) for reach in (0.015, 0.0))
+    state, sensors = walk(plain, 13)[-1][0], random_sensors(core, 3)
+    points = core.sample_points(state, sensors)
+    assert points.shape == (4, core.points, 2) and core.points == 146 and plain.points == 25
+    np.testing.assert_array_equal(points[:, :25], plain.sample_points(state, sensors))
+    centres = core.centres(state, sensors)
+    np.testing.assert_allclose(points[:, 25:], centres[:, None] + tg.footholds.offsets())
+
+
 @pytest.mark.parametrize("tilt", [0.0, 0.1])
 def test_feet_come_down_where_the_feet_in_stance_are_whatever_the_trunk_does(subject, tilt):
     """A trunk 2 cm too low, and tilted: at the end of the step LF and RR are led to the height of the other feet."""
@@ -557,10 +598,11 @@ def test_mirroring_twice_changes_nothing(subject):
 # NumPy and JAX ------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("refine", [0.0, 0.015])
 @pytest.mark.parametrize("name", sorted(SUBJECTS))
-def test_numpy_and_jax_give_the_same_numbers(name):
+def test_numpy_and_jax_give_the_same_numbers(name, refine):
     """Single precision, thirty steps of which each goes on from NumPy's state."""
-    core = SUBJECTS[name].make(np.float32)
+    core = SUBJECTS[name].make(np.float32, refine=refine, follow=False)
     observe, act = jax.jit(core.observe), jax.jit(core.act)
     rng = np.random.default_rng(0)
     state = core.initial_state(np.asarray(0.5 * np.pi, np.float32))
@@ -574,8 +616,9 @@ def test_numpy_and_jax_give_the_same_numbers(name):
         seen = core.observe(state, sensors, heights, command)
         assert seen.dtype == np.float32
         np.testing.assert_allclose(observe(*on_device), seen, atol=1e-6)
-        after, desired = core.act(state, action, sensors, command)
-        there, wanted = act(on_device[0], jnp.asarray(action), *on_device[1:2], on_device[3])
+        patch = rng.uniform(-0.7, 0.0, (4, tg.footholds.COUNT)).astype(np.float32)
+        after, desired = core.act(state, action, sensors, command, patch)
+        there, wanted = act(on_device[0], jnp.asarray(action), *on_device[1:2], on_device[3], patch)
         assert desired.dtype == np.float32
         np.testing.assert_allclose(wanted, desired, atol=1e-6)
         for field, one, other in zip(after._fields, after, there, strict=True):

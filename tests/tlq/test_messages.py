@@ -57,6 +57,15 @@ def test_sensor_messages_come_out_as_they_went_in(message):
         np.testing.assert_array_equal(array, getattr(message, name))
 
 
+def test_a_patch_of_heights_comes_out_as_it_went_in():
+    heights = np.random.default_rng(0).normal(size=(4, Sensing.MOST)).astype(np.float32)
+    data = sensing(heights=heights).pack()
+    assert len(data) <= LARGEST
+    found = unpack(data)
+    np.testing.assert_array_equal(found.heights, heights)
+    np.testing.assert_array_equal(found.command, sensing().command.astype(np.float32))
+
+
 @given(TARGETS)
 def test_targets_come_out_as_they_went_in(message):
     found = unpack(message.pack())
@@ -113,7 +122,7 @@ def test_foreign_bytes_are_refused(data):
 @given(st.binary(max_size=600), st.integers(0, 255), st.integers(0, 255), st.integers(0, 65535))
 def test_foreign_bytes_under_our_name_and_a_right_checksum_are_refused(body, version, kind, size):
     data = b"TLQM" + struct.pack("<BBHQQ", version, kind, size, 0, 0) + body
-    if (version, kind, size, len(body)) in ((2, 1, 532, 532), (2, 2, 100, 100)):
+    if (version, kind, size, len(body)) in ((2, 1, 532, 532), (2, 1, 2468, 2468), (2, 2, 100, 100)):
         return
     with pytest.raises(MessageError):
         unpack(data + struct.pack("<I", zlib.crc32(data)))
@@ -129,5 +138,7 @@ def test_other_versions_are_named():
 def test_wrong_shapes_are_not_sent():
     with pytest.raises(ValueError, match=r"heights has shape \(25, 4\); expected \(4, 25\)"):
         sensing(heights=np.zeros((25, 4))).pack()
+    with pytest.raises(ValueError, match=r"heights has shape \(4, 26\)"):
+        sensing(heights=np.zeros((4, 26))).pack()
     with pytest.raises(ValueError, match=r"desired has shape \(11,\)"):
         targets(desired=np.zeros(11)).pack()

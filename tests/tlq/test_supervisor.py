@@ -76,7 +76,7 @@ BAD = {
     "joint_position": [put(NAN, 11), put(-np.inf, 4), put(3.0, 2), put(-1.2, 0), lambda q: q + 100],
     "joint_velocity": [put(NAN, 5), put(51.0, 0)],
     "command": [put(NAN, 0), put(0.5, 0), lambda c: 3 * c],
-    "heights": [put(NAN, (3, 24)), put(np.inf, (0, 0)), put(-3.1, (1, 1))],
+    "heights": [put(NAN, (3, 24)), put(np.inf, (0, 0)), put(-3.1, (1, 1)), lambda h: np.tile(h, 2)],
 }
 
 
