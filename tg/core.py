@@ -526,7 +526,7 @@ class Core:
 
     @functools.cached_property
     def _patch_offsets(self) -> Array:
-        return self._constant(footholds.offsets().tolist())
+        return self._constant(footholds.offsets())
 
     @functools.cached_property
     def _swings(self) -> Array:

@@ -5,10 +5,7 @@ they tell which, but not to the centimetre. The patch tells that: near the place
 where it meets the least gap, landing with some error. Letters: L legs, N = SIDE^2 points.
 """
 
-import functools
 from typing import Any
-
-import numpy as np
 
 from tg import path
 
@@ -34,16 +31,17 @@ FROM, ALL = 0.3, 1.5
 """Phases (rad) of swing from which on a foot is shifted, and from which on by all of it."""
 
 
-@functools.cache
-def _axis() -> np.ndarray:
-    """(SIDE,) m, ascending."""
-    return (np.arange(SIDE) - (SIDE - 1) / 2) * CELL
+_AXIS = [(i - (SIDE - 1) / 2) * CELL for i in range(SIDE)]
+"""Coordinates (m) of the points along one axis, ascending."""
+_CHOICES = [2.0 * i / (CHOICES - 1) - 1.0 for i in range(CHOICES)]
+"""Coordinates of the places in reach along one axis, in units of the reach."""
+_WITHIN = [[1.0 * (x * x + y * y <= 1.3) for y in _CHOICES] for x in _CHOICES]
+"""Which of these places count: a disc's, with the corners cut off."""
 
 
-def offsets() -> np.ndarray:
+def offsets() -> list[list[float]]:
     """The N points (x, y) m of the patch from the end of the step, heading frame; y runs fastest."""
-    x, y = np.meshgrid(_axis(), _axis(), indexing="ij")
-    return np.stack([x, y], axis=-1).reshape(-1, 2)
+    return [[x, y] for x in _AXIS for y in _AXIS]
 
 
 def shift(led: Array, patch: Array, reach: float) -> Array:
@@ -57,8 +55,8 @@ def shift(led: Array, patch: Array, reach: float) -> Array:
     xp, kind = led.__array_namespace__(), led.dtype
     low = xp.reshape(xp.max(patch, axis=-1, keepdims=True) - patch > DEEP, (-1, SIDE, SIDE))
     gap = xp.astype(low, kind)
-    choices = xp.asarray(np.linspace(-reach, reach, CHOICES), dtype=kind)
-    axis = xp.asarray(_axis(), dtype=kind)
+    choices = xp.asarray(_CHOICES, dtype=kind) * reach
+    axis = xp.asarray(_AXIS, dtype=kind)
     places = led[:, :, None] + choices
     # A normal distribution is one along x times one along y; relative to the nearest point, which keeps it above 0.
     squares = xp.square(places[..., None] - axis)
@@ -69,10 +67,7 @@ def shift(led: Array, patch: Array, reach: float) -> Array:
     square = xp.square(x) + xp.square(y)
     cost = GAP * met + FARTHER * xp.sqrt(square + 1e-6) + square / FAR**2
     cost = cost - xp.min(cost, axis=(1, 2), keepdims=True)
-    # A disc's, with the corners cut off.
-    across = np.add.outer(np.linspace(-1, 1, CHOICES) ** 2, np.linspace(-1, 1, CHOICES) ** 2)
-    within = xp.asarray(np.where(across <= 1.3, 1.0, 0.0), dtype=kind)
-    weight = within * xp.exp(-cost / SHARPNESS)
+    weight = xp.asarray(_WITHIN, dtype=kind) * xp.exp(-cost / SHARPNESS)
     weight = weight / xp.sum(weight, axis=(1, 2), keepdims=True)
     moved = xp.stack([xp.sum(weight, axis=2) @ choices, xp.sum(weight, axis=1) @ choices], axis=-1)
     return xp.where(xp.any(low, axis=(1, 2))[:, None], moved, 0.0 * moved)

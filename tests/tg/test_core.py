@@ -268,7 +268,7 @@ def test_a_patch_is_wanted_round_the_same_places(subject):
     assert points.shape == (4, core.points, 2) and core.points == 146 and plain.points == 25
     np.testing.assert_array_equal(points[:, :25], plain.sample_points(state, sensors))
     centres = core.centres(state, sensors)
-    np.testing.assert_allclose(points[:, 25:], centres[:, None] + tg.footholds.offsets())
+    np.testing.assert_allclose(points[:, 25:], centres[:, None] + np.array(tg.footholds.offsets()))
 
 
 @pytest.mark.parametrize("tilt", [0.0, 0.1])

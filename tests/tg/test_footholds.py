@@ -7,7 +7,7 @@ import pytest
 
 from tg import footholds
 
-POINTS = footholds.offsets()
+POINTS = np.array(footholds.offsets())
 
 
 def ground(*tops, radius=0.06):

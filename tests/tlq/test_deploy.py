@@ -305,7 +305,7 @@ def test_heights_are_asked_for_where_the_next_step_wants_them():
         np.testing.assert_array_equal(np.isnan(centres), np.stack([~swing, ~swing], axis=-1))
         sensors, feet = sim.exact_sensors(), core.feet(sim.exact_sensors())[:, :2]
         np.testing.assert_allclose(
-            sim.points, core.around(np.where(np.isnan(centres), feet, centres)), atol=1e-6
+            sim.points, core.wanted(np.where(np.isnan(centres), feet, centres)), atol=1e-6
         )
         wanted = core.centres(controller.state, sensors)
         errors += list(np.linalg.norm(centres - wanted, axis=1)[swing])
