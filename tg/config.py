@@ -82,8 +82,9 @@ class TGConfig:
     """Time (s) by which feet are ahead on their way along the step, to make up for joints that follow late, at
     `base_frequency`. Their height isn't ahead: feet that come down early are nearer to where they were led."""
     refine: float = 0.0
-    """Largest distance (m) by which the controller shifts where a foot in swing is led, off the gaps near there, by a
-    dense patch of heights round the end of its step; 0: the policy alone says where. See `tg.footholds`."""
+    """Largest distance (m) along each axis by which the controller shifts where a foot in swing is led, off the gaps
+    near there, by a dense patch of heights round the end of its step; 0: the policy alone says where. See
+    `tg.footholds`."""
     touch_down: float = 0.0
     """Share of the trunk's rise, fall and tilt that is taken out of the height of feet in swing: 1 leads them to the
     height of the feet in stance, so that they come down when the step ends, whatever the trunk does; 0, as in the

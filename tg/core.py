@@ -34,6 +34,8 @@ SUNK = 0.06
 HANDED_BACK = 0.3
 """Share of stance in which that is given up again."""
 
+NUDGE = 0.01
+"""Joint angle (rad) by which the slope of the legs' kinematics is taken; long enough for single precision."""
 _DOWN = 1e-3
 """Sine of the phase below which all feet are down."""
 _LATE = 1e-4
@@ -418,13 +420,10 @@ class Core:
         xp, bound = residual.__array_namespace__(), self.config.residual_range
         led = ((leg.forward(self.geometry, tg_angles + residual) - targets) @ level.T)[:, :2]
         moved = share[:, None] * footholds.shift(led, patch, self.config.refine)
-        columns, small = [], 0.01  # rad; long enough for single precision
-        for joint in range(3):
-            unit = self._constant([small * (i == joint) for i in range(3)])
-            ahead, behind = (
-                leg.forward(self.geometry, tg_angles + residual + side * unit) for side in (1.0, -1.0)
-            )
-            columns.append((((ahead - behind) / (2.0 * small)) @ level.T)[:, :2])
+        angles, columns = tg_angles + residual, []
+        for nudge in self._nudges:
+            ahead, behind = (leg.forward(self.geometry, x) for x in (angles + nudge, angles - nudge))
+            columns.append((((ahead - behind) / (2.0 * NUDGE)) @ level.T)[:, :2])
         slope = xp.stack(columns, axis=-1)  # (4, 2, 3) m/rad
         # The smallest change of the three angles that moves the foot so, in the plane.
         a, b = slope[:, 0], slope[:, 1]
@@ -527,6 +526,11 @@ class Core:
     @functools.cached_property
     def _patch_offsets(self) -> Array:
         return self._constant(footholds.offsets())
+
+    @functools.cached_property
+    def _nudges(self) -> Array:
+        """(3, 3) rad, one joint of a leg after the other turned by `NUDGE`."""
+        return self._constant([[NUDGE * (i == j) for i in range(3)] for j in range(3)])
 
     @functools.cached_property
     def _swings(self) -> Array:

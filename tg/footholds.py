@@ -21,12 +21,16 @@ ERROR = 0.035
 """Standard deviation (m) of a landing foot from its place, by which the gaps near a place count."""
 GAP, FARTHER, FAR = 3.0, 1.0, 0.17
 """What a place costs that is nothing but gap; a metre from the end of the trajectory generator's step; and at which
-distance (m) from there, with the square of it, a place costs 1. As in `envs.guide`."""
+distance (m) from there, with the square of it, a place costs 1. As in `envs.guide`, but
+not taken from there: what teaches the next policy must not move the feet of those that are shipped."""
 SHARPNESS = 0.1
 """Difference of cost by which one place outweighs another e times: where the foot goes is a weighted mean of the places
 in reach, so that it doesn't jump from one to another."""
 CHOICES = 5
 """Places in reach along one axis."""
+CORNERS = 1.3
+"""Places count up to this sum of the squares of their two coordinates in units of the reach: a square's without its
+corners."""
 FROM, ALL = 0.3, 1.5
 """Phases (rad) of swing from which on a foot is shifted, and from which on by all of it."""
 
@@ -35,8 +39,8 @@ _AXIS = [(i - (SIDE - 1) / 2) * CELL for i in range(SIDE)]
 """Coordinates (m) of the points along one axis, ascending."""
 _CHOICES = [2.0 * i / (CHOICES - 1) - 1.0 for i in range(CHOICES)]
 """Coordinates of the places in reach along one axis, in units of the reach."""
-_WITHIN = [[1.0 * (x * x + y * y <= 1.3) for y in _CHOICES] for x in _CHOICES]
-"""Which of these places count: a disc's, with the corners cut off."""
+_WITHIN = [[1.0 * (x * x + y * y <= CORNERS) for y in _CHOICES] for x in _CHOICES]
+"""Which of these places count."""
 
 
 def offsets() -> list[list[float]]:

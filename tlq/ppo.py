@@ -182,6 +182,7 @@ class Learner:
         strides = [s for s in range(1, STRIDE + 1) if config.unroll % s == 0]
         self.stride = 1 if networks.footholds is None else strides[-1]
         self._clip = optax.clip_by_global_norm(config.max_grad_norm)
+        # The gradient is scaled down before, by parts. `identity` stands where that was done, for checkpoints' sake.
         self._optimiser = optax.chain(optax.identity(), optax.scale_by_adam(eps=1e-5))
         self._loss = functools.partial(ppo_loss, networks=networks, config=config, axis=AXIS)
         self._foothold_loss = functools.partial(foothold_loss, networks=networks)

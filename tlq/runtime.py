@@ -28,7 +28,6 @@ VERSION = 1
 LARGEST = 1 << 28
 """Bytes a policy file may unpack to."""
 
-
 Sensors = Mapping[str, np.ndarray]
 
 _SHAPES = {"orientation": (4,), "angular_velocity": (3,), "joint_position": (12,), "joint_velocity": (12,)}
@@ -128,12 +127,12 @@ class Controller:
         length = math.hypot(*direction.tolist())
         if length > 1e-6 and abs(length - 1.0) > 0.01:
             raise ValueError(f"command has length {length:.3g}; give a unit vector, or 0, 0 to stand")
-        shape = (4, self.core.points)
+        seen = patch = None
         if self.core.heights:
+            shape = (4, self.core.points)
             if heights is None:
                 raise ValueError(f"heights is None; this policy needs an array of shape {shape}")
-            heights = _array("heights", heights, shape)
-        seen, patch = (None, None) if heights is None else np.split(heights, [tg.samples.COUNT], axis=1)
+            seen, patch = np.split(_array("heights", heights, shape), [tg.samples.COUNT], axis=1)
         self.observation = self.core.observe(self.state, measured, seen, direction)
         self.action, self.memory = self._graph(self.observation, self.memory)
         self.state, desired = self.core.act(self.state, self.action, measured, direction, patch)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import envs
+import tg
 from envs.env import exact_sensors
 from tests.envs.subjects import change, change_episode, standing
 
@@ -118,6 +119,29 @@ def test_heights_drift_with_the_episode_and_shake_with_the_step(noisy):
     ground = np.asarray(feet)[:, :, None] - np.asarray(seen).reshape(500, 4, 25) / 5 + episode.qpos[2]
     assert ground.mean() == pytest.approx(0.008, abs=2e-4)
     np.testing.assert_allclose(ground.std(), r.height_noise, rtol=0.03)
+
+
+def test_a_patch_of_heights_drifts_as_the_map_does(noisy):
+    """A robot whose map is off by some centimetres reads what one that stands there reads of a true map."""
+    env, yaw, off = noisy.env, 0.7, np.array([0.03, -0.05])
+    turned = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]) @ off
+    terrain = int(
+        np.flatnonzero(np.asarray(env.bank.heights).reshape(env.bank.heights.shape[0], -1).std(axis=1))[0]
+    )
+
+    def patch(xy, drift):
+        episode = change_episode(
+            noisy.state.pipeline_state, qpos=standing(env, xy=xy, yaw=yaw), terrain=terrain
+        )
+        randomised = episode.randomised.replace(map_offset=jnp.array([*drift, 0.0], jnp.float32))
+        episode = episode.replace(randomised=randomised)
+        return np.asarray(env._patch(episode, exact_sensors(episode)))
+
+    here, there = (np.array([1.0, 0.8]) + move for move in (0, turned))
+    drifted = patch(here, off)
+    assert drifted.shape == (4, tg.footholds.COUNT) and drifted.std() > 0.001
+    np.testing.assert_allclose(drifted, patch(there, (0.0, 0.0)), atol=2e-3)
+    assert np.abs(drifted - patch(here, (0.0, 0.0))).max() > 0.01
 
 
 # Physics ----------------------------------------------------------------------------------------------------------
