@@ -71,6 +71,7 @@ def ppo_loss(
     ratio = jnp.exp(distribution.log_prob(parameters, {"action": rollout.action}) - rollout.log_prob)
     clipped = jnp.clip(ratio, 1 - config.clip, 1 + config.clip)
     policy_loss = -jnp.mean(jnp.minimum(ratio * advantages, clipped * advantages))
+    surrogate = -jnp.mean(ratio * advantages)  # without clipping, which alone makes `policy_loss` positive
     value_loss = 0.5 * config.value_loss * jnp.mean(jnp.square(targets - values))
     by_env = jax.vmap(lambda p, key: distribution.entropy({"action": p}, key), in_axes=(1, 0), out_axes=1)
     entropy_loss = -config.entropy * jnp.mean(by_env(parameters["action"], keys))
@@ -91,6 +92,7 @@ def ppo_loss(
     return total, {
         "total": total,
         "policy": policy_loss,
+        "surrogate": surrogate,
         "value": value_loss,
         "entropy": entropy_loss,
         "guide": guide_loss,

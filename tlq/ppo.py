@@ -514,7 +514,7 @@ def _loss_metrics(losses: dict[str, jax.Array], minibatches: int) -> dict[str, j
     """Means over the gradient steps (each (epochs x minibatches,)); `kl_last` over the last pass."""
     figures = {
         f"loss/{n}": jnp.mean(losses[n])
-        for n in ("policy", "value", "entropy", "guide", "taken_over", "total", "grad_norm")
+        for n in ("policy", "surrogate", "value", "entropy", "guide", "taken_over", "total", "grad_norm")
     }
     figures |= {n: jnp.mean(losses[n]) for n in ("std", "std_max", "skipped") if n in losses}
     finite = jnp.isfinite(losses["total"]) & jnp.isfinite(losses["grad_norm"])
