@@ -565,6 +565,7 @@ def test_the_loss_is_braxs(learner, trained):
     assert float(loss) == pytest.approx(float(expected), rel=1e-5)
     for name, brax_name in [("policy", "policy_loss"), ("value", "v_loss"), ("kl", "kl_mean")]:
         assert float(parts[name]) == pytest.approx(float(other[brax_name]), rel=1e-4, abs=1e-6)
+    assert float(parts["surrogate"]) < float(parts["policy"])  # clipping only ever takes away
     for x, y in zip(jax.tree.leaves(grads), jax.tree.leaves(expected_grads), strict=True):
         np.testing.assert_allclose(x, y, rtol=1e-3, atol=1e-5)
 
