@@ -83,7 +83,15 @@ def test_what_a_run_leaves_behind(run, tmp_path, capsys):
         "episodes",
         "level",
     }
-    expected |= {"loss/policy", "loss/surrogate", "loss/value", "kl", "std", "learning_rate", "steps_per_second"}
+    expected |= {
+        "loss/policy",
+        "loss/surrogate",
+        "loss/value",
+        "kl",
+        "std",
+        "learning_rate",
+        "steps_per_second",
+    }
     assert expected <= set(rows[0])
     assert list(folder.glob("events.*")) and (folder / "curve.png").stat().st_size > 1000
     assert [p.name for p in (folder / "checkpoints").iterdir() if p.is_dir()] == ["3"]
