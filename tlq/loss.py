@@ -73,8 +73,10 @@ def ppo_loss(
     policy_loss = -jnp.mean(jnp.minimum(ratio * advantages, clipped * advantages))
     surrogate = -jnp.mean(ratio * advantages)  # without clipping, which alone makes `policy_loss` positive
     value_loss = 0.5 * config.value_loss * jnp.mean(jnp.square(targets - values))
-    by_env = jax.vmap(lambda p, key: distribution.entropy({"action": p}, key), in_axes=(1, 0), out_axes=1)
-    entropy_loss = -config.entropy * jnp.mean(by_env(parameters["action"], keys))
+    entropy_loss = jnp.float32(0)
+    if config.entropy:  # its noise takes time
+        by_env = jax.vmap(lambda p, key: distribution.entropy({"action": p}, key), in_axes=(1, 0), out_axes=1)
+        entropy_loss = -config.entropy * jnp.mean(by_env(parameters["action"], keys))
     guide_loss = jnp.float32(0)
     if rollout.guide is not None and networks.footholds is None:
         mean = jnp.tanh(jnp.split(parameters["action"], 2, axis=-1)[0])

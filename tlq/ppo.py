@@ -19,6 +19,7 @@ import optax
 from brax.envs.base import Env, State
 from brax.training.acme import running_statistics
 from brax.training.agents.ppo.losses import PPONetworkParams
+from jax.flatten_util import ravel_pytree
 from jax.sharding import Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
 
@@ -373,7 +374,7 @@ class Learner:
             errors = jax.tree.map(lambda x: x[:: self.stride], errors)
             guidance = jax.vmap(jax.vmap(guide.with_errors))(guidance, *errors)
         rollout = rollout.replace(guide=guidance)
-        metrics = jax.tree.map(lambda x: jax.lax.pmean(jnp.mean(x, axis=0), AXIS), metrics)
+        metrics = _over_devices(jax.tree.map(lambda x: jnp.mean(x, axis=0), metrics))
         return env_state, rollout, summarise(metrics, self.steps_per_iteration)
 
     def _numbers(self) -> jax.Array:
@@ -435,7 +436,7 @@ class Learner:
             (_, losses), grads = jax.value_and_grad(self._loss, has_aux=True)(
                 params, state.normaliser, batch, carry[index], last[index], _keys(key, numbers[index])
             )
-            grads, losses = jax.lax.pmean((grads, losses), AXIS)
+            grads, losses = _over_devices((grads, losses))
             stepped = self._improve(params, opt_state, grads, state.learning_rate)
             figures = dict(losses, grad_norm=optax.global_norm(grads))
             if c.kl_target > 0 and c.kl_stop > 0:
@@ -479,7 +480,7 @@ class Learner:
             footholds, opt_state = carried
             batch = jax.tree.map(lambda x: x[:, index], data)
             cost, grads = jax.value_and_grad(self._foothold_loss)(footholds, state.normaliser, *batch)
-            cost, grads = jax.lax.pmean((cost, grads), AXIS)
+            cost, grads = _over_devices((cost, grads))
             return self._descend(footholds, opt_state, grads, c.guide_rate), cost
 
         (footholds, opt_state), costs = jax.lax.scan(
@@ -491,6 +492,12 @@ class Learner:
 def _keys(key: jax.Array, numbers: jax.Array) -> jax.Array:
     """A key for each environment, by its number."""
     return jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, numbers)
+
+
+def _over_devices(parts: Any) -> Any:
+    """Means over the devices, taken together: on a CPU they wait for each other at every array."""
+    flat, restored = ravel_pytree(parts)
+    return restored(jax.lax.pmean(flat, AXIS))
 
 
 def summarise(means: dict[str, jax.Array], steps: int) -> dict[str, jax.Array]:
