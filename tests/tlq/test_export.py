@@ -10,12 +10,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import terrains
 import tlq.export
 from envs.robot import RobotConfig, make_robot
 from tests.tlq.policies import trained
-from tlq.cli import UsageError
+from tlq.cli import UsageError, find_policy
+from tlq.config import training_env
 from tlq.graph import OPERATORS, Graph, GraphError
-from tlq.runtime import load_policy
+from tlq.runtime import Controller, load_policy
+from tlq.simulation import Simulation
 from tlq.training import initialise
 
 
@@ -123,6 +126,27 @@ def test_onnx_stays_with_the_runtime_for_a_thousand_steps(method, memory, tmp_pa
             np.testing.assert_allclose(one, other, rtol=0, atol=1e-5)
         memories = [got[1], wanted[1]]
     assert np.abs(memories[0]).max() > 0.01  # the memory was in use
+
+
+def test_onnx_stays_with_a_shipped_policy_that_walks_over_poles(tmp_path):
+    """A thousand steps, anew after each fall: trained weights are larger than those of a fresh network."""
+    onnxruntime = pytest.importorskip("onnxruntime")
+    tlq.export.main(["policy=poles", f"out={tmp_path / 'policy.onnx'}"])
+    session = onnxruntime.InferenceSession(tmp_path / "policy.onnx", providers=["CPUExecutionProvider"])
+    controller = Controller(find_policy("poles"))
+    poles = terrains.make_terrain("poles", 0.5, seed=10_000)
+    sim = Simulation(controller, poles, training_env(controller.metadata))
+    memory = controller.memory
+    for _ in range(1000):
+        if sim.fell() or np.abs(sim.data.qpos[:2]).max() > 4.5:
+            sim.reset()
+            memory = controller.memory
+        sim.step(np.array([1.0, 0.0]))
+        action, memory = session.run(
+            ["action", "memory_out"], {"observation": np.float32(controller.observation), "memory": memory}
+        )
+        np.testing.assert_allclose(action, controller.action, rtol=0, atol=1e-5)
+        np.testing.assert_allclose(memory, controller.memory, rtol=0, atol=1e-5)
 
 
 def test_training_starts_from_a_file(file, made, capsys):
