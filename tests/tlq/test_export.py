@@ -129,7 +129,10 @@ def test_onnx_stays_with_the_runtime_for_a_thousand_steps(method, memory, tmp_pa
 
 
 def test_onnx_stays_with_a_shipped_policy_that_walks_over_poles(tmp_path):
-    """A thousand steps, anew after each fall and short of the terrain's rim: trained weights are larger than those of a fresh network."""
+    """A thousand steps, anew after each fall and short of the terrain's rim.
+
+    Trained weights are larger than those of a fresh network.
+    """
     onnxruntime = pytest.importorskip("onnxruntime")
     tlq.export.main(["policy=poles", f"out={tmp_path / 'policy.onnx'}"])
     session = onnxruntime.InferenceSession(tmp_path / "policy.onnx", providers=["CPUExecutionProvider"])
