@@ -119,9 +119,8 @@ class Parts:
 
     def physics(self, steps: int) -> Callable[[], Any]:
         """Control steps on a plane."""
-        desired = jnp.asarray(self.env.core.standing_target)
         with mock.patch.object(terrains, "contact", flat_contact):  # while it is traced
-            return self.repeated(lambda e: self.env._simulate(e, desired), steps)
+            return self.repeated(lambda e: self.env._simulate(e, e.controller), steps)
 
     def contacts(self, e: envs.Episode) -> envs.Episode:
         """One look-up of the surfaces near four feet."""

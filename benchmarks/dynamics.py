@@ -43,7 +43,6 @@ def functions(env: envs.QuadrupedEnv, options: Options) -> dict[str, tuple[Calla
     resetting = envs.AutoReset(env)
     keys = jax.random.split(jax.random.key(0), options.num_envs)
     state = jax.jit(jax.vmap(resetting.reset))(keys)
-    desired = jnp.asarray(env.core.standing_target)
 
     def repeated(step: Callable[[Any], Any]) -> Callable[[Any], Any]:
         def run(x: Any) -> Any:
@@ -52,7 +51,7 @@ def functions(env: envs.QuadrupedEnv, options: Options) -> dict[str, tuple[Calla
         return jax.jit(run)
 
     return {
-        "physics": (repeated(lambda e: env._simulate(e, desired)), state.pipeline_state),
+        "physics": (repeated(lambda e: env._simulate(e, e.controller)), state.pipeline_state),
         "environment": (repeated(lambda s: resetting.step(s, jnp.zeros(env.action_size))), state),
     }
 

@@ -60,8 +60,8 @@ def trot_mjx(env: envs.QuadrupedEnv, count: int):
 
         def step(episode, _):
             sensors, heading = env.sense(episode), env.heading_command(episode)
-            controller, desired = env.core.act(episode.controller, jnp.zeros(14), sensors, heading)
-            episode = env._simulate(episode, desired).replace(controller=controller)
+            controller, _ = env.core.act(episode.controller, jnp.zeros(14), sensors, heading)
+            episode = env._simulate(episode, controller).replace(controller=controller)
             return episode, jnp.stack([episode.qpos[:3], episode.qvel[:3]])
 
         return jax.lax.scan(step, episode.replace(controller=start), length=STEPS)[1]

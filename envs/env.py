@@ -258,7 +258,7 @@ class QuadrupedEnv(Env):
         sensors, command = self.sense(before), self.heading_command(before)
         patch = self._patch(before, sensors) if self.core.config.refine else None
         controller, desired = self.core.act(before.controller, action, sensors, command, patch)
-        after = self._simulate(before, desired)
+        after = self._simulate(before, controller)
         after = after.replace(controller=controller, step=before.step + 1)
         below, around = self._terrain_at_feet(after)
         after = after.replace(
@@ -437,8 +437,8 @@ class QuadrupedEnv(Env):
 
     # -- physics
 
-    def _simulate(self, episode: Episode, desired: jax.Array) -> Episode:
-        """Physics over one control period, joints under PD control."""
+    def _simulate(self, episode: Episode, controller: tg.ControllerState) -> Episode:
+        """Physics over one control period, joints under PD control by the controller's new state."""
         c, r = self.config, episode.randomised
         contact = functools.partial(
             terrains.contact, self.bank, episode.terrain, floor=episode.floor, num_planes=c.num_planes
@@ -447,12 +447,15 @@ class QuadrupedEnv(Env):
         key, key_push = jax.random.fold_in(episode.key, 0), jax.random.fold_in(episode.key, 4)
         substep = self._substep(r, contact)
         kp, kd = c.robot.kp * r.kp_factor, c.robot.kd * r.kd_factor
+        damping, damped_before = (kd * self.core.damping(x) for x in (controller, episode.controller))
         limit = self.robot.torque_limit
 
         def one(carry, i):
             qpos, qvel, warmstart, _ = carry
-            followed = jnp.where(i < r.latency, episode.controller.desired, desired)
-            torque = jnp.clip(kp * (followed - qpos[7:]) - kd * qvel[6:], -limit, limit)
+            late = i < r.latency
+            followed = jnp.where(late, episode.controller.desired, controller.desired)
+            damped = jnp.where(late, damped_before, damping)
+            torque = jnp.clip(kp * (followed - qpos[7:]) - damped * qvel[6:], -limit, limit)
             force = jnp.concatenate([jnp.zeros(6), torque])
             return (*substep(qpos, qvel, warmstart, force), torque), None
 
@@ -689,5 +692,6 @@ def make_core(config: EnvConfig, robot: Robot) -> tg.Core:
         upper=f32(robot.joint_upper),
         dt=config.control_dt,
         sag=float(robot.mass * 9.81 / config.robot.kp),
+        slack=config.robot.kd / config.robot.kp,
         heights=config.method != "blind",
     )

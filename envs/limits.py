@@ -72,6 +72,7 @@ LIMITS: dict[str, tuple[float, float]] = {
     "tg.refine": (0.0, 0.05),
     "tg.look_ahead_from": (-math.pi, 0.0),
     "tg.touch_down": _SHARE,
+    "tg.stance_damping": (0.0, 10.0),
     "tg.start_time": (1e-3, 10.0),
     "tg.mirror_hysteresis": _SHARE,
     "tg.sample_radius": (0.04, 0.5),

@@ -126,6 +126,8 @@ class Core:
     """Control period (s)."""
     sag: float
     """Weight of the robot over kp (N·rad/(N·m)): how far a joint sags by a lever of 1 m."""
+    slack: float
+    """kd over kp (s): how far a joint that is damped stays behind per speed."""
     heights: bool = True
     """Whether the policy sees the terrain (not with `method=blind`)."""
 
@@ -387,6 +389,8 @@ class Core:
         sag = leg.support_torque(
             self.geometry, wanted, c.weight_compensation * self.sag * load_share(phases, gate), reached
         )
+        if c.stance_damping != 1.0:
+            sag = sag + self._drag(tg_angles, targets, stride, frequency, phases, gate, level)
         desired = xp.clip(xp.reshape(wanted + sag, (12,)), self.lower, self.upper)
         velocity = self.odometry(state, sensors, level) if c.look_ahead else state.velocity
         rate = frames.yaw_rate(up, sensors.angular_velocity)
@@ -404,6 +408,34 @@ class Core:
             velocity=velocity,
         )
         return state, desired
+
+    def _drag(
+        self,
+        tg_angles: Array,
+        targets: Array,
+        stride: Array,
+        frequency: Array,
+        phases: Array,
+        gate: Array,
+        level: Array,
+    ) -> Array:
+        """What makes up (4, 3) rad for the damping that legs in stance have beyond the others.
+
+        So it brakes what the trunk does beside walking on, and not the walking. Residual angles aren't counted.
+
+        Args:
+          tg_angles, targets: (4, 3) rad and m, the trajectory generator's.
+          stride: (2,) direction, heading frame.
+          frequency: () Hz.
+          phases: (4,) rad.
+          gate: () share of the vertical motion.
+          level: (3, 3) `heading_from_trunk`.
+        """
+        xp, c = stride.__array_namespace__(), self.config
+        way = -self.dt * self.stance_speed(frequency) * gate * stride  # of the feet, from the trunk
+        ahead = targets + xp.concatenate([way, 0.0 * way[:1]]) @ level
+        speed = (leg.inverse(self.geometry, ahead) - tg_angles) / self.dt
+        return (c.stance_damping - 1.0) * self.slack * _standing(phases, gate)[:, None] * speed
 
     def _refined(
         self, residual: Array, tg_angles: Array, targets: Array, level: Array, share: Array, patch: Array
@@ -433,6 +465,12 @@ class Core:
         scale = aa * bb - ab * ab
         u, v = (bb * p - ab * q) / scale, (aa * q - ab * p) / scale
         return xp.clip(residual + u[:, None] * a + v[:, None] * b, -bound, bound)
+
+    def damping(self, state: ControllerState) -> Array:
+        """Factor (12,) on the joint controller's derivative gain, which goes with `ControllerState.desired`."""
+        xp, c = state.phase.__array_namespace__(), self.config
+        factor = 1.0 + (c.stance_damping - 1.0) * _standing(self.phases(state.phase), state.gate)
+        return xp.reshape(factor[:, None] + xp.zeros((1, 3), dtype=factor.dtype), (12,))
 
     def stepping(self, state: ControllerState, command: Array) -> Array:
         """Whether feet that are in swing by their phase move, () bool: with a command, and to the end of the last step.
@@ -572,9 +610,14 @@ def load_share(phases: Array, gate: Array) -> Array:
       phases: (4,) rad.
       gate: () share of the vertical motion.
     """
+    stance = _standing(phases, gate)
+    return stance / stance.__array_namespace__().sum(stance)
+
+
+def _standing(phases: Array, gate: Array) -> Array:
+    """1 for legs (4,) in stance, 0 in swing, and smoothly from one to the other near the ground."""
     xp = phases.__array_namespace__()
-    stance = 1.0 - gate * xp.minimum(4.0 * path.height(phases), 1.0 + 0.0 * phases)
-    return stance / xp.sum(stance)
+    return 1.0 - gate * xp.minimum(4.0 * path.height(phases), 1.0 + 0.0 * phases)
 
 
 _KIND = {

@@ -129,8 +129,8 @@ class PolicyServer:
             return
         sent = time.monotonic_ns()
         mode = int(self.supervisor.mode)
-        centres = self.supervisor.centres()
-        answer = Targets(self.ticks, sent, last.sequence, last.time, mode, desired, centres)
+        damping, centres = self.supervisor.controller.damping, self.supervisor.centres()
+        answer = Targets(self.ticks, sent, last.sequence, last.time, mode, desired, damping, centres)
         try:
             self.socket.sendto(answer.pack(), self.robot)
         except OSError:
@@ -204,6 +204,7 @@ class Robot:
         self.socket.connect(tuple(address))
         self.socket.setblocking(False)
         self.desired = np.array(simulation.controller.core.standing_target, float)
+        self.damping = simulation.controller.damping
         self.centres = np.full((4, 2), np.nan)
         self.sent = self.received = self.refused = self.newest = 0
         self.distance, self.fell = 0.0, False
@@ -230,7 +231,7 @@ class Robot:
             if self._receive():
                 self.waits.append(time.monotonic() - heard)
                 heard = time.monotonic()
-            self.sim.substep(self.desired)
+            self.sim.substep(self.desired, self.damping)
 
     def report(self) -> dict[str, Any]:
         """Measurements and counts."""
@@ -276,11 +277,12 @@ class Robot:
                 message = _unpacked(self.socket.recv(LARGEST), Targets)
             except OSError:
                 break
-            if message is None or message.sequence <= self.newest or not np.isfinite(message.desired).all():
+            whole = message is not None and np.isfinite([message.desired, message.damping]).all()
+            if message is None or message.sequence <= self.newest or not whole:
                 self.refused += 1
                 continue
             came, self.newest, self.desired = True, message.sequence, message.desired
-            self.centres = message.centres
+            self.damping, self.centres = message.damping, message.centres
             self.received += 1
             if message.mode == Mode.WALK:
                 self.trips.append(time.monotonic() - 1e-9 * message.answers_time)

@@ -17,7 +17,7 @@ import numpy as np
 import tg
 
 MAGIC = b"TLQM"
-VERSION = 2
+VERSION = 3
 LARGEST = 4096
 """Bytes to read at most; every message is shorter, and without a patch of heights it stays one Ethernet packet."""
 
@@ -100,24 +100,27 @@ class Targets:
     """`tlq.supervisor.Mode`."""
     desired: np.ndarray
     """(12,) rad, for the joints' PD controllers."""
+    damping: np.ndarray
+    """(12,) N m s/rad, their derivative gains."""
     centres: np.ndarray
     """(4, 2) m, heading frame, from the trunk's centre: round these places the next message's heights are wanted. NaN:
     round the foot."""
 
     def pack(self) -> bytes:
         """The message's bytes; raises ValueError where an array has another shape."""
-        desired, centres = (np.asarray(x, "<f4") for x in (self.desired, self.centres))
-        if desired.shape != (12,) or centres.shape != (4, 2):
-            shapes = f"desired has shape {desired.shape}, centres {centres.shape}"
-            raise ValueError(f"{shapes}; expected (12,) and (4, 2)")
+        parts = [np.asarray(x, "<f4") for x in (self.desired, self.damping, self.centres)]
+        desired, damping, centres = (part.shape for part in parts)
+        if (desired, damping, centres) != ((12,), (12,), (4, 2)):
+            shapes = f"desired has shape {desired}, damping {damping}, centres {centres}"
+            raise ValueError(f"{shapes}; expected (12,), (12,) and (4, 2)")
         answer = _ANSWER.pack(self.answers, self.answers_time, self.mode)
-        body = answer + desired.tobytes() + centres.tobytes()
+        body = answer + b"".join(part.tobytes() for part in parts)
         return _frame(self.KIND, self.sequence, self.time, body)
 
 
 _NUMBERS = sum(int(np.prod(shape)) for shape in Sensing.FIELDS.values())
 _PATCHED = _NUMBERS + 4 * tg.footholds.COUNT
-_BODY = {Sensing.KIND: (4 * _NUMBERS, 4 * _PATCHED), Targets.KIND: (_ANSWER.size + 4 * (12 + 8),)}
+_BODY = {Sensing.KIND: (4 * _NUMBERS, 4 * _PATCHED), Targets.KIND: (_ANSWER.size + 4 * (12 + 12 + 8),)}
 
 
 def unpack(data: bytes) -> Sensing | Targets:
@@ -138,7 +141,8 @@ def unpack(data: bytes) -> Sensing | Targets:
         return Sensing(sequence, time, **_arrays(body))
     numbers = np.frombuffer(body, "<f4", offset=_ANSWER.size).astype(np.float32)
     answers, answers_time, mode = _ANSWER.unpack_from(body)
-    return Targets(sequence, time, answers, answers_time, mode, numbers[:12], numbers[12:].reshape(4, 2))
+    desired, damping, centres = np.split(numbers, [12, 24])
+    return Targets(sequence, time, answers, answers_time, mode, desired, damping, centres.reshape(4, 2))
 
 
 def _frame(kind: int, sequence: int, time: int, body: bytes) -> bytes:

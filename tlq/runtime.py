@@ -89,6 +89,11 @@ class Controller:
         self.observation = np.zeros(self.core.observation_size, np.float32)
         """(S,) what the policy was shown last."""
 
+    @property
+    def damping(self) -> np.ndarray:
+        """Derivative gains (12,) N m s/rad that go with the last desired joint angles: `kd`, in stance by a factor."""
+        return self.kd * np.asarray(self.core.damping(self.state))
+
     def keep_heading(self) -> None:
         """Takes the present heading as the one to keep (at first that of `reset`), while everything else goes on."""
         self.state = self.state._replace(turn=0.0 * self.state.turn)
@@ -120,7 +125,8 @@ class Controller:
           command: (2,) unit vector, direction in the heading frame; 0 to stand.
 
         Returns:
-          Desired joint angles (12,) rad for a PD controller with gains `kp` and `kd` (which damps the joint's speed).
+          Desired joint angles (12,) rad for a PD controller with the gains `kp` and `damping` (which damps the joint's
+          speed).
         """
         measured = _sensors(sensors)
         direction = _array("command", command, (2,))
@@ -254,6 +260,9 @@ def _core(metadata: dict[str, Any]) -> tg.Core:
             name: numbers(metadata["leg"][name], f"leg.{name}", *shape) for name, shape in shapes.items()
         }
         settings = tg.TGConfig(**(tg.BEFORE | metadata["tg"]))
+        kp, kd = (float(numbers(metadata[name], name)) for name in ("kp", "kd"))
+        if kp <= 0.0:
+            raise PolicyFileError("metadata: kp must be above 0")
         core = tg.Core(
             settings,
             tg.LegGeometry(**geometry),
@@ -263,10 +272,11 @@ def _core(metadata: dict[str, Any]) -> tg.Core:
             upper=numbers(metadata["joint_upper"], "joint_upper", 12),
             dt=float(metadata["control_dt"]),
             sag=float(metadata["sag"]),
+            slack=kd / kp,
             heights=metadata["observation"][-1]["name"] == "heights",
         )
         numbers(metadata["torque_limit"], "torque_limit", 12)
-        for name in ("control_dt", "kp", "kd", "sag"):
+        for name in ("control_dt", "sag"):
             numbers(metadata[name], name)
         if settings.gait not in tg.path.GAITS:
             raise PolicyFileError(f"metadata: tg.gait must be one of {', '.join(tg.path.GAITS)}")

@@ -86,7 +86,8 @@ class Simulation:
         """One control period, towards a direction (2,) in the world (a unit vector; 0: stand)."""
         command = tg.frames.turn(np.asarray(-self.yaw), np.asarray(direction, float))
         desired = self.controller.step(self.sensors, self.heights, command)
-        work = sum(self.substep(desired) for _ in range(self.substeps))
+        damping = self.controller.damping
+        work = sum(self.substep(desired, damping) for _ in range(self.substeps))
         self.look()
         return self.moment(work)
 
@@ -132,11 +133,16 @@ class Simulation:
         hit = points[:, 2] < exact_height(self.terrain, points[:, :2])
         return bool(hit.any() or rotation[2, 2] < self.config.min_up)
 
-    def substep(self, desired: np.ndarray) -> float:
-        """One timestep under PD control; returns sum of |torque x speed| dt (J)."""
+    def substep(self, desired: np.ndarray, damping: np.ndarray) -> float:
+        """One timestep under PD control to `desired` (J,) rad; returns sum of |torque x speed| dt (J).
+
+        damping: (J,) N m s/rad, as `Controller.damping`.
+        """
         c, data, limit = self.controller, self.data, self.controller.torque_limit
         speed = data.qvel[self._v]
-        torque = np.minimum(np.maximum(c.kp * (desired - data.qpos[self._q]) - c.kd * speed, -limit), limit)
+        torque = np.minimum(
+            np.maximum(c.kp * (desired - data.qpos[self._q]) - damping * speed, -limit), limit
+        )
         data.ctrl[self._motors] = torque
         mujoco.mj_step(self.model, data)
         return float(np.abs(torque) @ np.abs(speed)) * self.model.opt.timestep

@@ -1,5 +1,6 @@
 import pytest
 
+import tg
 from tests.envs.subjects import Subject, config
 
 
@@ -11,5 +12,5 @@ def exact():
 
 @pytest.fixture(scope="session")
 def noisy():
-    """An environment as in training: randomised, and `step` resets."""
-    return Subject(config(), auto_reset=True)
+    """An environment as in training: randomised, and `step` resets. Legs in stance are damped twice as much."""
+    return Subject(config(tg=tg.TGConfig(stance_damping=2.0)), auto_reset=True)

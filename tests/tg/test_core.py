@@ -51,6 +51,50 @@ def walk(core, steps, command=LEFT, seed=0, state=None, action=None):
     return found
 
 
+def test_legs_in_stance_are_damped_more_and_those_in_swing_are_not(subject):
+    core = subject.make(np.float64, stance_damping=3.0)
+    walking = core.initial_state(np.asarray(0.0))._replace(gate=np.asarray(1.0))
+
+    def factor(phase, gate=1.0, of=core):
+        state = walking._replace(phase=np.asarray(phase), gate=np.asarray(gate))
+        return of.damping(state)
+
+    first, second = [0, 1, 2, 9, 10, 11], [3, 4, 5, 6, 7, 8]
+    for phase, up, down in ((0.5 * np.pi, first, second), (-0.5 * np.pi, second, first)):
+        found = factor(phase)
+        np.testing.assert_allclose(found[up], 1.0)
+        np.testing.assert_allclose(found[down], 3.0)
+        np.testing.assert_allclose(factor(phase, gate=0.0), 3.0)
+        np.testing.assert_array_equal(factor(phase, of=subject.core), 1.0)
+    np.testing.assert_allclose(factor(0.0), 3.0)
+    cycle = np.array([factor(p) for p in tg.path.wrap(np.linspace(0, 2 * np.pi, 2001))])
+    assert cycle.min() >= 1.0 and cycle.max() <= 3.0
+    assert np.abs(np.diff(cycle, axis=0)).max() < 0.03
+
+
+def test_more_damping_in_stance_brakes_no_joint_that_moves_as_the_gait_does(subject):
+    """kp (desired - q) - damping q' is the same with it as without for a leg on its way in stance."""
+    core, plain = (subject.make(np.float64, stance_damping=x) for x in (3.0, 1.0))
+    state = core.initial_state(np.asarray(-1.8))._replace(gate=np.asarray(1.0), stride=LEFT)
+    sensors = random_sensors(core, 3)
+    after, desired = core.act(state, np.zeros(14), sensors, LEFT)
+    _, before = plain.act(state, np.zeros(14), sensors, LEFT)
+
+    def angles(time):
+        phase = after.phase + 2 * np.pi * core.config.base_frequency * time
+        targets = core.foot_targets(core.phases(phase), after.lift, LEFT, sensors, gate=after.gate)
+        return tg.leg.inverse(core.geometry, targets).reshape(12)
+
+    speed = (angles(core.dt) - angles(0.0)) / core.dt
+    kp, kd = subject.config.kp, subject.config.kd
+    stance = core.damping(after) == 3.0
+    assert stance.sum() == 6 and np.abs(speed[stance]).max() > 0.5
+    np.testing.assert_allclose(
+        (kp * desired - 3 * kd * speed)[stance], (kp * before - kd * speed)[stance], rtol=1e-6
+    )
+    np.testing.assert_allclose(desired[~stance], before[~stance])
+
+
 # Phase and gait -----------------------------------------------------------------------------------------------
 
 

@@ -259,7 +259,7 @@ def episode(sim, seed, share):
             count.wild += not (tame and inside)
             desired = wanted
         for _ in range(sim.substeps):
-            sim.substep(desired)
+            sim.substep(desired, sim.controller.damping)
         sim.look()
         if sim.fell():
             count.falls = 1
@@ -299,7 +299,7 @@ def test_heights_are_asked_for_where_the_next_step_wants_them():
         desired = supervisor.step(message, now)
         centres = supervisor.centres()
         for _ in range(sim.substeps):
-            sim.substep(desired)
+            sim.substep(desired, sim.controller.damping)
         sim.look(centres)
         swing = tg.path.leg_phases(controller.state.phase) > 0
         np.testing.assert_array_equal(np.isnan(centres), np.stack([~swing, ~swing], axis=-1))

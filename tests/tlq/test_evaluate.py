@@ -172,7 +172,7 @@ def test_knees_are_those_of_training_unless_asked_otherwise(file, tmp_path):
         assert simulation.fell() == fallen
         desired, lowest = data.qpos[robot.qpos_ids].copy(), []
         for _ in range(150):
-            simulation.substep(desired)
+            simulation.substep(desired, simulation.controller.damping)
             lowest.append(data.xpos[robot.knee_ids, 2].min())
         # Half of a second later they carry the robot, or it has sunk through the ground to its feet.
         assert (min(lowest) > 0.01) == (not fallen)

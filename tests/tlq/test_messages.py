@@ -24,7 +24,7 @@ SENSING = st.builds(
     Sensing, sequence=COUNT, time=COUNT, **{name: numbers(*shape) for name, shape in Sensing.FIELDS.items()}
 )
 TARGETS = st.builds(
-    Targets, COUNT, COUNT, COUNT, COUNT, st.integers(0, 2**32 - 1), numbers(12), numbers(4, 2)
+    Targets, COUNT, COUNT, COUNT, COUNT, st.integers(0, 2**32 - 1), numbers(12), numbers(12), numbers(4, 2)
 )
 
 
@@ -41,6 +41,7 @@ def targets(**changes):
         "answers_time": 4,
         "mode": 2,
         "desired": np.arange(12.0),
+        "damping": np.arange(12.0) / 8,
         "centres": np.arange(8.0).reshape(4, 2),
     }
     return Targets(**values | changes)
@@ -72,14 +73,15 @@ def test_targets_come_out_as_they_went_in(message):
     assert isinstance(found, Targets)
     for name in ("sequence", "time", "answers", "answers_time", "mode"):
         assert getattr(found, name) == getattr(message, name)
-    np.testing.assert_array_equal(found.desired, message.desired)
+    for name in ("desired", "damping", "centres"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(message, name))
 
 
 def test_the_bytes_are_those_of_the_document():
     """Read by hand, at the offsets that docs/deployment.md gives."""
     data = sensing(command=np.array([0.6, -0.8])).pack()
     assert len(data) == 560 < LARGEST
-    assert data[:8] == b"TLQM" + bytes([2, 1]) + struct.pack("<H", 532)
+    assert data[:8] == b"TLQM" + bytes([3, 1]) + struct.pack("<H", 532)
     assert struct.unpack_from("<QQ", data, 8) == (7, 123456789)
     assert struct.unpack_from("<4f", data, 24) == pytest.approx(np.linspace(-1, 1, 4), abs=1e-6)
     assert struct.unpack_from("<12f", data, 52) == pytest.approx(np.linspace(-1, 1, 12), abs=1e-6)
@@ -87,11 +89,12 @@ def test_the_bytes_are_those_of_the_document():
     assert struct.unpack_from("<100f", data, 156) == pytest.approx(np.linspace(-1, 1, 100), abs=1e-6)
     assert struct.unpack_from("<I", data, 556)[0] == zlib.crc32(data[:556])
     data = targets().pack()
-    assert len(data) == 128 and data[:8] == b"TLQM" + bytes([2, 2]) + struct.pack("<H", 100)
+    assert len(data) == 176 and data[:8] == b"TLQM" + bytes([3, 2]) + struct.pack("<H", 148)
     assert struct.unpack_from("<QQQQI", data, 8) == (1, 2, 3, 4, 2)
     assert struct.unpack_from("<12f", data, 44) == tuple(range(12))
-    assert struct.unpack_from("<8f", data, 92) == tuple(range(8))
-    assert struct.unpack_from("<I", data, 124)[0] == zlib.crc32(data[:124])
+    assert struct.unpack_from("<12f", data, 92) == tuple(i / 8 for i in range(12))
+    assert struct.unpack_from("<8f", data, 140) == tuple(range(8))
+    assert struct.unpack_from("<I", data, 172)[0] == zlib.crc32(data[:172])
 
 
 @pytest.mark.parametrize("message", [sensing(), targets()], ids=["sensing", "targets"])

@@ -245,6 +245,7 @@ def graph(number, **changes):
         ({"metadata": lambda x: np.array("{")}, "damaged: its metadata isn't JSON"),
         ({"graph": lambda x: np.array("{}")}, "damaged: its graph is of the wrong type"),
         ({"metadata": metadata(default_pose=[0.0] * 11)}, r"default_pose must be \(12,\) finite numbers"),
+        ({"metadata": metadata(kp=0.0)}, "kp must be above 0"),
         ({"metadata": metadata(kp=float("nan"))}, r"kp must be \(\) finite numbers"),
         ({"metadata": metadata(tg__lift="high")}, "metadata: something is missing or wrong"),
         ({"metadata": metadata(tg__gait="pace")}, "metadata: tg.gait must be one of trot, walk"),
