@@ -63,6 +63,9 @@ class Options:
         -1.0, "share of the trunk's motion that swing leaves out; negative: the policy's"
     )
     lead: float = cli.option(-1.0, "time by which feet are ahead on their way (s); negative: the policy's")
+    stance_damping: float = cli.option(
+        -1.0, "factor on the derivative gain of legs in stance; negative: the policy's"
+    )
     robots: int = cli.option(96, "episodes, two on each terrain")
     seconds: float = cli.option(8.0, "longest episode")
     json: str = cli.option("", "file for the result")
@@ -79,6 +82,7 @@ def make_env(policy: Policy, options: Options) -> envs.QuadrupedEnv:
         "tg.step_length": options.step_length or own.tg.step_length,
         "tg.touch_down": options.touch_down if options.touch_down >= 0 else own.tg.touch_down,
         "tg.lead": options.lead if options.lead >= 0 else own.tg.lead,
+        "tg.stance_damping": options.stance_damping if options.stance_damping >= 0 else own.tg.stance_damping,
     }
     config = settings.changed(
         own,

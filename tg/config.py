@@ -90,7 +90,7 @@ class TGConfig:
     """Share of the trunk's rise, fall and tilt that is taken out of the height of feet in swing: 1 leads them to the
     height of the feet in stance, so that they come down when the step ends, whatever the trunk does; 0, as in the
     paper, to a height below their hips."""
-    stance_damping: float = 1.0
+    stance_damping: float = 3.0
     """Factor on the derivative gain of the joints of legs in stance. The trunk bounces on its two legs' springs at
     little more than the gait's frequency; more damping in stance calms it, and in swing feet would follow late. The
     walking itself isn't braked: what that takes is added to the desired angles."""

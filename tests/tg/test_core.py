@@ -65,7 +65,7 @@ def test_legs_in_stance_are_damped_more_and_those_in_swing_are_not(subject):
         np.testing.assert_allclose(found[up], 1.0)
         np.testing.assert_allclose(found[down], 3.0)
         np.testing.assert_allclose(factor(phase, gate=0.0), 3.0)
-        np.testing.assert_array_equal(factor(phase, of=subject.core), 1.0)
+        np.testing.assert_array_equal(factor(phase, of=subject.make(np.float64, stance_damping=1.0)), 1.0)
     np.testing.assert_allclose(factor(0.0), 3.0)
     cycle = np.array([factor(p) for p in tg.path.wrap(np.linspace(0, 2 * np.pi, 2001))])
     assert cycle.min() >= 1.0 and cycle.max() <= 3.0
