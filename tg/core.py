@@ -390,7 +390,9 @@ class Core:
             self.geometry, wanted, c.weight_compensation * self.sag * load_share(phases, gate), reached
         )
         if c.stance_damping != 1.0:
-            sag = sag + self._drag(tg_angles, targets, stride, frequency, phases, gate, level)
+            # Not `frequency`: told to stand, the gait stops where it is, while its gate fades out.
+            passed = path.wrap(phase - state.phase) / (2.0 * math.pi * self.dt)
+            sag = sag + self._drag(tg_angles, targets, stride, passed, phases, gate, level)
         desired = xp.clip(xp.reshape(wanted + sag, (12,)), self.lower, self.upper)
         velocity = self.odometry(state, sensors, level) if c.look_ahead else state.velocity
         rate = frames.yaw_rate(up, sensors.angular_velocity)
@@ -426,7 +428,7 @@ class Core:
         Args:
           tg_angles, targets: (4, 3) rad and m, the trajectory generator's.
           stride: (2,) direction, heading frame.
-          frequency: () Hz.
+          frequency: () Hz, at which the phase really advances.
           phases: (4,) rad.
           gate: () share of the vertical motion.
           level: (3, 3) `heading_from_trunk`.

@@ -93,6 +93,13 @@ def test_more_damping_in_stance_brakes_no_joint_that_moves_as_the_gait_does(subj
         (kp * desired - 3 * kd * speed)[stance], (kp * before - kd * speed)[stance], rtol=1e-6
     )
     np.testing.assert_allclose(desired[~stance], before[~stance])
+    # Told to stand, the feet stay where they came down: there is nothing to make up for.
+    for of in (core, plain):
+        standing = after
+        for _ in range(30):
+            standing, angles_now = of.act(standing, np.zeros(14), sensors, STAND)
+        desired, before = angles_now, desired
+    np.testing.assert_allclose(desired, before)
 
 
 # Phase and gait -----------------------------------------------------------------------------------------------

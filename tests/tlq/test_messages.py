@@ -134,7 +134,7 @@ def test_foreign_bytes_under_our_name_and_a_right_checksum_are_refused(body, ver
 def test_other_versions_are_named():
     data = bytearray(sensing().pack())
     data[4] = 9
-    with pytest.raises(MessageError, match="message version 9; this program reads version 2"):
+    with pytest.raises(MessageError, match="message version 9; this program reads version 3"):
         unpack(bytes(data))
 
 

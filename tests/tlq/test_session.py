@@ -64,7 +64,7 @@ def test_it_walks_where_it_is_told_and_stands_when_told(flat):
     assert flat.energy_per_metre == pytest.approx(flat.work / y)
     assert flat.time == pytest.approx(60 * 0.02)
     flat.stand()
-    run(flat, 40)
+    run(flat, 60)
     before = flat.sim.data.qpos[1]
     run(flat, 10)
     assert flat.sim.data.qpos[1] == pytest.approx(before, abs=0.02)
