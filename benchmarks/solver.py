@@ -8,8 +8,8 @@ training. Deviations are of the trunk, medians over the directions. Speeds are o
 batches of 256, and mean something only relative to each other.
 """
 
+import dataclasses
 import json
-import sys
 import time
 from collections.abc import Sequence
 
@@ -22,6 +22,8 @@ import envs
 import terrains
 import tg
 from envs.scene import build_scene
+from tlq import cli
+from tlq.files import whole
 
 DIRECTIONS, BATCH, STEPS = 8, 256, 26
 TIMES = (5, 10, 25)
@@ -84,8 +86,9 @@ def trot_c(env: envs.QuadrupedEnv, iterations: int = 100) -> np.ndarray:
             sensors = tg.Sensors(q[3:7], v[3:6], q[7:], v[6:])
             heading = tg.frames.turn(-tg.frames.yaw(q[3:7]), command)
             state, desired = env.core.act(state, np.zeros(14, np.float32), sensors, heading)
+            damping = robot.config.kd * env.core.damping(state)
             for _ in range(env.substeps):
-                torque = robot.config.kp * (desired - data.qpos[7:]) - robot.config.kd * data.qvel[6:]
+                torque = robot.config.kp * (desired - data.qpos[7:]) - damping * data.qvel[6:]
                 data.ctrl[:] = np.clip(torque, -robot.torque_limit, robot.torque_limit)
                 mujoco.mj_step(model, data)
             found[i, t] = data.qpos[:3], data.qvel[:3]
@@ -116,8 +119,17 @@ def measure() -> list[dict[str, float]]:
     return rows
 
 
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """The command line."""
+
+    json: str = cli.option("", "file for the table")
+
+
 def main(arguments: Sequence[str]) -> None:
     """Prints the table; `json=FILE` also writes it."""
+    options = cli.parse(Options, arguments, __doc__ or "")
+    cli.check_folders(options, "json")
     rows = measure()
     print(
         "planes  iterations  "
@@ -129,13 +141,10 @@ def main(arguments: Sequence[str]) -> None:
             f"{1e3 * r[f'position_{20 * t}ms']:14.2f}{r[f'speed_{20 * t}ms']:8.4f}" for t in TIMES
         )
         print(f"{r['planes']:6}{r['iterations']:12}  {apart}{r['steps_per_second']:14.0f}")
-    for argument in arguments:
-        key, _, path = argument.partition("=")
-        if key != "json" or not path:
-            raise SystemExit(f"unknown argument '{argument}'; choose json=FILE")
-        with open(path, "w") as file:
-            json.dump(rows, file, indent=1)
+    if options.json:
+        with whole(options.json) as temporary:
+            temporary.write_text(json.dumps(rows, indent=1) + "\n")
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    cli.run(main)
